@@ -88,12 +88,12 @@ $(VENV)/docs: $(VENV)/core
 
 $(VENV)/test: $(VENV)/core
 	@echo 'Installing the test dependencies, PyTorch among them, into $(VENV): 1.8 GB on disk, a few minutes'
-	@$(PIP) -e '.[models,sheets,slurm,test]'
+	@$(PIP) -e '.[models,slurm,test]'
 	@touch $@
 
 $(VENV)/dev: $(VENV)/test
 	@echo 'Installing the linters into $(VENV): 0.1 GB on disk, under a minute'
-	@$(PIP) -e '.[models,sheets,slurm,test,dev]'
+	@$(PIP) -e '.[models,slurm,test,dev]'
 	@touch $@
 
 clean:

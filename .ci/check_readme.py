@@ -13,7 +13,8 @@ import re
 import sys
 from pathlib import Path
 
-from su3d_bench.reports.tables.run import markdown_table
+from su3d_bench.reports.tables.formats import markdown
+from su3d_bench.reports.tables.run import run_tables
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 BEGIN = "<!-- demo table: written by `su3d-bench run`, checked by .ci/check_readme.py -->\n"
@@ -49,7 +50,7 @@ def _over_tolerance(shown: str, written: str, tolerance: float) -> list[str]:
 
 def main(arguments: list[str]) -> int:
     run = Path(next(one for one in arguments if not one.startswith("--")))
-    written = markdown_table(json.loads((run / "metrics.json").read_text())).strip()
+    written = markdown(run_tables(json.loads((run / "metrics.json").read_text()))).strip()
     readme = README.read_text()
     if "--write" in arguments:
         README.write_text(readme.replace(table_in(readme) or END, written if table_in(readme) else f"{written}\n{END}"))

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Install a browser, an office suite and LaTeX for the tests that use them, if possible; without them those tests skip.
+# Install a browser and LaTeX for the tests that use them, if possible; without them those tests skip.
 set -u
 
 has() { for name in "$@"; do command -v "$name" >/dev/null && return 0; done; return 1; }
@@ -15,10 +15,8 @@ install() {
 }
 
 browsers=(chromium chromium-browser google-chrome google-chrome-stable chrome)  # as in tests/support/programs/chromium.py
-offices=(soffice libreoffice)
 missing=()
 has "${browsers[@]}" || missing+=("chromium")
-has "${offices[@]}" || missing+=("libreoffice-calc python3-uno")
 has pdflatex || missing+=("texlive-latex-base texlive-latex-recommended")
 [ ${#missing[@]} = 0 ] || as_root apt-get update -qq >/dev/null 2>&1 </dev/null
 for packages in "${missing[@]}"; do

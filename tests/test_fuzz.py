@@ -27,7 +27,7 @@ N_INPUTS = 10  # per reader, besides pipes and the like; python benchmarks fuzz 
 USUAL = (
     *("prediction scannet-text", "prediction openmask3d", "prediction conceptgraphs", "prediction hovsg"),
     *("prediction su3d-bench", "file ascii.ply", "file binary_compressed.pcd", "file a.png", "file a.npz"),
-    *("file map.pkl.gz", "file q.toml", "dataset replica", "run", "answers ann.xlsx", "archive a.tar.gz"),
+    *("file map.pkl.gz", "file q.toml", "dataset replica", "run", "answers ann.csv", "archive a.tar.gz"),
 )
 N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "2"))  # of random arguments per verb
 # A verb that could start work with its name only gets arguments that prevent this.

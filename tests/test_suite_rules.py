@@ -12,8 +12,8 @@ from pathlib import Path
 from places import ROOT, TESTS
 
 FILES = sorted(TESTS.rglob("*.py"))
-# Exceptions where time matters: the one loop that waits, a slow dataset and method, a program of
-# LibreOffice's own Python, a program whose duration is measured, and programs that are killed.
+# Exceptions where time matters: the one loop that waits, a slow dataset and method, a program whose duration is
+# measured, and programs that are killed.
 MAY_SLEEP = {
     "waiting.py",
     "painted.py",

@@ -45,7 +45,6 @@ VERBS = {
 def load_verbs() -> None:
     """Import these verbs' modules in this process."""
     import matplotlib.figure  # noqa: F401
-    import openpyxl  # noqa: F401
 
 
 def make_inputs(folder: Path) -> None:

@@ -130,14 +130,6 @@ def _uncertainty(shares: Float64Array) -> str | None:
     )
 
 
-def judge_convention(frames: Sequence[Frame]) -> Finding | None:
-    """The best other reading, if it wins nearly every pair that distinguishes it from the current one.
-
-    Frames without motion between them, or a single frame, decide nothing.
-    """
-    return _best_other(_shares(frames))
-
-
 def _shares(frames: Sequence[Frame]) -> Float64Array:
     """The share of points that agree, for each pair of frames (rows) and reading (columns)."""
     cache: dict[int, Frame] = {}
@@ -152,6 +144,10 @@ def _shares(frames: Sequence[Frame]) -> Float64Array:
 
 
 def _best_other(shares: Float64Array) -> Finding | None:
+    """The best other reading, if it wins nearly every pair that distinguishes it from the current one.
+
+    Frames without motion between them, or a single frame, decide nothing.
+    """
     best: Finding | None = None
     for column, (motion, factor) in enumerate(READINGS[1:], start=1):
         gains = shares[:, column] - shares[:, 0]

@@ -203,11 +203,9 @@ SUBJECTS = {
     "retrieval": ("Retrieval by text", "is the top-ranked instance correct?"),
     "annotation": ("Labels and merging of instances", "is the label correct, how is the mask merged?"),
     "reasoning": ("Spatial reasoning", "are the answer and its objects correct?"),
-    "questions": ("Generated questions", "do they make sense, are wording and answer correct?"),
 }
 JUDGES = {"people": "annotators", "automatic": "ground truth"}
 GROUND_TRUTH_NOTE = "Ground-truth rows: the same items, judged automatically if the ground truth covers them"
-QUESTION_NOTE = "A question counts by its worst rating; arguable: questions whose worst rating is arguable"
 SHOWN_TESTS = 60  # pairs of methods per metric; scores.json has all
 
 
@@ -248,18 +246,16 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
     judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
     judged += "; unanswered questions are excluded" if is_partial else ""
     judged = judged if people else f"not judged by annotators; {scores['n_items']} items"
-    origin = f" of run {scores['run']}" if scores["run"] else ""
     return Table(
         name=f"{scores['kind']}-{dataset}",
         caption=f"{subject} on {dataset}, {counted(n_scenes, 'scene')}: {question}",
-        head="kind" if scores["kind"] == "questions" else "method",
+        head="method",
         columns=tuple(metrics),
         rows=tuple(rows),
         notes=(
             "Per cent; in brackets Wilson's 95 % confidence interval over items, then the number of items. An item "
-            "judged by several annotators counts once, with the share of them who chose it. "
-            + (QUESTION_NOTE if scores["kind"] == "questions" else GROUND_TRUTH_NOTE),
-            f"set {scores['sheet_id']}{origin}; {judged}",
+            f"judged by several annotators counts once, with the share of them who chose it. {GROUND_TRUTH_NOTE}",
+            f"set {scores['sheet_id']} of run {scores['run']}; {judged}",
             *(printable(remark, 300) for remark in scores["remarks"]),
             *([f"{ROLE_LABELS[scores['kind']]}{printable(by, 200)}"] if (by := scores["answered_by"]) else []),
             *([f"'cannot tell' is excluded: at most {counted(unclear, 'judgement')} per number"] if unclear else []),
@@ -317,24 +313,19 @@ def _disagree(test: Mapping[str, Any]) -> bool:
 
 def _agreements(agreements: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
-    is_ordered = any(question["agreement"]["ordinal_alpha"] is not None for question in agreements)
     for question in agreements:
         of = question["agreement"]
         share = f"{of['n_equal']}/{of['n_items']}"
         beside = bracketed(of["interval"], "{:.2f}".format)
         fleiss = f"(n={of['n_fleiss']}, {of['n_raters']} each)" if of["fleiss"] is not None else ""
         cells = (Cell(str(of["n_annotators"])), Cell(share), Cell(_coefficient(of["alpha"]), beside))
-        ordinal = (Cell(_coefficient(of["ordinal_alpha"])),) if is_ordered else ()
         last = (Cell(_coefficient(of["fleiss"]), fleiss), Cell(_coefficient(of["ac1"])))
-        rows.append(TableRow(question["ask"], (*cells, *ordinal, *last)))
+        rows.append(TableRow(question["ask"], (*cells, *last)))
     return Table(
         name="agreement",
         caption="Agreement of annotators.",
         head="question",
-        columns=(
-            *("annotators", "all equal", "Krippendorff's alpha", *(["ordinal alpha"] if is_ordered else [])),
-            *("Fleiss' kappa", "Gwet's AC1"),
-        ),
+        columns=(*("annotators", "all equal", "Krippendorff's alpha", "Fleiss' kappa", "Gwet's AC1"),),
         rows=tuple(rows),
         notes=(
             "1: full agreement, 0: chance level; over items with at least two answers; 'cannot tell' is an answer; in "

@@ -11,7 +11,6 @@ from su3d_bench.core.english import is_countable, plural
 from su3d_bench.core.errors import counted, printable, some
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, is_count, percent, text_table, with_interval
 from su3d_bench.metrics.scoring import EVERY_SCENE
-from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling, label_count_notes, label_notes
 from su3d_bench.store.records import UnscoredRecord
 
@@ -159,11 +158,6 @@ NOTE_OF_MEAN = (
     "over scenes weights each scene equally and averages over the classes in it, so the two differ"
 )
 CHEAP = {"chance": "by chance", "names-alone": "by names alone"}  # prefix of metric names -> row label
-
-
-def markdown_table(metrics: Mapping[str, Any]) -> str:
-    """Return the tables of a run as Markdown that is also readable as plain text."""
-    return markdown(run_tables(metrics))
 
 
 def run_tables(

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench.cli.output import answer_either
+from su3d_bench.cli.output import answer_either, size_text
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, Su3dError, counted, printable, shown
 from su3d_bench.core.version import documentation
 
@@ -66,7 +66,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def examine() -> list[Check]:
     """All checks, in order of installation."""
-    return [_python(), *_libraries(), *_folders(), _kernels(), *_datasets(), _models(), _cores(), _memory()]
+    return [_python(), *_libraries(), *_folders(), *_datasets(), _models(), _cores(), _memory()]
 
 
 def _python() -> Check:
@@ -172,7 +172,6 @@ def _folders() -> Iterator[Check]:
 def _folder(what: str, folder: Path, setting: str) -> Check:
     """Check that ``folder`` can be written and locked and has free space."""
     from su3d_bench.core.files.locks import NO_LOCKS, hold_folder
-    from su3d_bench.store.caches import size_text
 
     existing = next((place for place in (folder, *folder.parents) if place.exists()), Path("/"))
     where = shown(folder) if existing == folder else f"{shown(folder)} (not created yet)"
@@ -188,14 +187,6 @@ def _folder(what: str, folder: Path, setting: str) -> Check:
     if free >= MIN_FREE_BYTES:
         return Check(what, "ok", found)
     return Check(what, "note", found, f"free some space, or choose another with {setting}")
-
-
-def _kernels() -> Check:
-    from su3d_bench.store.caches import cache_warning, kernel_folders
-
-    slow = cache_warning()
-    kept = f"stored in the first writable one of: {', '.join(map(shown, kernel_folders()))}"
-    return Check("compiled code", "note" if slow else "ok", slow or kept)
 
 
 def _datasets() -> Iterator[Check]:
@@ -235,8 +226,6 @@ def _cores() -> Check:
 
 def _memory() -> Check:
     import psutil
-
-    from su3d_bench.store.caches import size_text
 
     memory = psutil.virtual_memory()
     found = f"{size_text(memory.total)}, {size_text(memory.available)} of it free"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("path RUN_OR_PREDICTION", "run folder, or files of predictions", type=Path)
     parser.option("--to", "format to write (of these evaluators)", required=True, choices=TARGETS)
     parser.option("--out DIR", "new folder for the files", type=output_path, required=True)
-    parser.option("--method METHOD", "method to use (default: the only one of the run)")
+    parser.option("--method METHOD", "method to use (default: the only one besides the oracle)")
     parser.shared("--scenes")
     parser.option("--input-format FORMAT", "format of the predictions (default: detected)")
     parser.option(
@@ -104,35 +104,24 @@ def _config_of(run: Path) -> RunConfig:
 
 def sources_of(path: Path, format: str | None, method: str | None) -> list[Source]:
     """All scenes at ``path``: of one method of a run folder, or found by the reader of its format."""
-    from su3d_bench.predictions.formats import READERS, recognise
+    from su3d_bench.core.registry import CEILING_METHOD
+    from su3d_bench.predictions.formats import recognise
+    from su3d_bench.predictions.run_predictions import OWN_RUNS, of_method
 
-    maps = _maps_of_run(path) if format in {None, "su3d-bench"} else {}
-    if not maps and method is not None:
-        raise ConfigError(f"--method {method}: only valid for a run folder, {path} is not one")
-    if maps:
-        method = method or _only_method(maps)
-        if method is None:
-            raise ConfigError(f"{path}: has maps of {', '.join(maps)}; choose one with --method")
-        if method not in maps:
-            raise ConfigError(f"{path}: no map of method '{method}'{suggest(method, maps, 'it has')}")
-        reader = READERS["su3d-bench"]
-        run = _run_of(maps[method][0])
-        return [Source(reader, file, name, name, run) for file in maps[method] for name in reader.scenes(file)]
-    reader = recognise(path, format)
+    files = sorted(path.glob("scenes/*/*/prediction.npz")) if format in {None, OWN_RUNS.name} else []
+    methods = list(dict.fromkeys(file.parent.name for file in files))
+    if method is not None and method not in methods:
+        if not methods:
+            raise ConfigError(f"--method {method}: only valid for a run folder, {path} is not one")
+        raise ConfigError(f"{path}: no map of method '{method}'{suggest(method, methods, 'it has')}")
+    named = [name for name in methods if name != CEILING_METHOD] or methods
+    if method is None and len(named) > 1:
+        raise ConfigError(f"{path}: has maps of {', '.join(named)}; choose one with --method")
+    reader = of_method(recognise(path, format), method or next(iter(named), None))
     scenes = reader.scenes(path)
     if not scenes:
         raise PredictionError(f"{printable(str(path), 300)}: no prediction in format '{reader.name}'")
-    return [Source(reader, path, name, name, _run_of(file)) for name, file in scenes.items()]
-
-
-def _only_method(maps: Mapping[str, Sequence[Path]]) -> str | None:
-    """The only method of a run, ignoring the added ground-truth ceiling."""
-    from su3d_bench.core.registry import CEILING_METHOD
-
-    run = _run_of(next(iter(maps.values()))[0])
-    is_single = run is not None and len(_config_of(run).methods) == 1
-    names = [name for name in maps if name != CEILING_METHOD] if is_single and len(maps) > 1 else list(maps)
-    return names[0] if len(names) == 1 else None
+    return [Source(reader, file if methods else path, name, name, _run_of(file)) for name, file in scenes.items()]
 
 
 def _run_of(file: Path) -> Path | None:
@@ -140,14 +129,6 @@ def _run_of(file: Path) -> Path | None:
     above = file.absolute().parents
     is_in_run = file.name == "prediction.npz" and len(above) > 3 and (above[3] / "run.toml").is_file()
     return above[3] if is_in_run else None
-
-
-def _maps_of_run(path: Path) -> dict[str, list[Path]]:
-    """The predictions of a run folder by method."""
-    maps: dict[str, list[Path]] = {}
-    for file in sorted(path.glob("scenes/*/*/prediction.npz")):
-        maps.setdefault(file.parent.name, []).append(file)
-    return maps
 
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, perception_config
-from su3d_bench.cli.output import answer_either, drawn_bars, remark
+from su3d_bench.cli.output import answer_either, drawn_bars, remark, size_text
 from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
@@ -100,8 +100,6 @@ def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
 
 def plan_lines(source: Source, here: Path | None) -> list[str]:
     """A source as lines: size, licence, addresses."""
-    from su3d_bench.store.caches import size_text
-
     about = "" if source.is_exact else "about "
     size = "size not stated" if source.n_bytes is None else f"{about}{size_text(source.n_bytes)}"
     return [

@@ -252,7 +252,6 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "labels n' by vote (sum of scores) or model (language model, as in the paper; default: vote)",
             choices=("vote", "model"),
         ),
-        option("--exclude-ids FILE", "CSV file with ids of questions to exclude"),
         option(
             "--text-features FILE",
             ".npz file with features of the class names, for predictions without labels",

@@ -25,6 +25,7 @@ MAX_UNSEEN = 8  # listed words
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: wide enough for a long bar, and for both bars
 MAX_BAR_LABEL = 80  # characters of the label
 LINE_EVERY_S = 10.0  # between lines of progress where there is no terminal
+MEGABYTE, GIGABYTE = 10**6, 10**9
 
 
 def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
@@ -75,6 +76,15 @@ def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Tab
     """Print ``value`` with ``--json``, otherwise the tables."""
     if not answer_json(arguments, value):
         answer_document(formatted(parts, arguments))
+
+
+def size_text(n_bytes: int) -> str:
+    """A size in MB or GB.
+
+    >>> size_text(1_234_567_890), size_text(56_700_000), size_text(1200)
+    ('1.2 GB', '56.7 MB', '0.0 MB')
+    """
+    return f"{n_bytes / GIGABYTE:.1f} GB" if n_bytes >= GIGABYTE else f"{n_bytes / MEGABYTE:.1f} MB"
 
 
 def show() -> None:

@@ -29,7 +29,6 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--out FILE", ".toml or .csv file to write", type=output_path, required=True)
     parser.option("--per-kind N", "maximum number per kind and scene (default: all)", type=count)
     parser.option("--generated", "generate all questions (default: use the dataset's own, if any)")
-    parser.shared("--exclude-ids")
     parser = add_verb(verbs, "show", _show)
     parser.option(
         "file FILE", "question set (.toml, .csv, ScanRefer, ...), or 'paper' for those of OpenSU3D's paper", type=str
@@ -45,7 +44,7 @@ def add_parser(verbs: Verbs) -> None:
 def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
-    su3d-bench query make --scenes 'homes/test*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
+    su3d-bench query make --scenes 'homes/test*' --per-kind 40 --out queries.toml
     su3d-bench query make --scenes replica/room0 --generated --out queries.csv
     """
     from su3d_bench.questions.question_files import check_form, write_questions
@@ -61,16 +60,11 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.questions.generator import chosen
     from su3d_bench.questions.ground_truths import questions_of
-    from su3d_bench.questions.query_files import read_excluded_ids
 
-    left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
-        found = questions_of(dataset, scene, own=not arguments.generated)
-        kept = [question for question in found if question.id not in left_out]
-        questions = chosen(kept, arguments.per_kind)
-        without = f", {len(found) - len(kept)} excluded" if left_out else ""
-        remark(f"{dataset.name}/{scene}: {counted(len(questions), 'question')}{without}", quiet=arguments.quiet)
+        questions = chosen(questions_of(dataset, scene, own=not arguments.generated), arguments.per_kind)
+        remark(f"{dataset.name}/{scene}: {counted(len(questions), 'question')}", quiet=arguments.quiet)
         made += questions
     return made
 

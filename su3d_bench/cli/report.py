@@ -15,7 +15,6 @@ from su3d_bench.core.errors import ConfigError, counted
 if TYPE_CHECKING:
     from su3d_bench.formats.tables.table import Table
 
-QUERY_KINDS = ("instance", "affordance", "property", "relative")
 PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
 
@@ -31,7 +30,6 @@ def add_parser(verbs: Verbs) -> None:
     _add_identity(actions)
     report_files.add_pages(actions)
     _add_instances(actions)
-    _add_claims(actions)
     _add_leaderboard(actions)
     _add_attribution(actions)
     _add_power(actions)
@@ -212,30 +210,6 @@ def call_instances(arguments: argparse.Namespace) -> None:
         n_predicted = sum(row.kind == "predicted" for row in found.rows)
         n_true = len(found.rows) - n_predicted
         output.answer(f"{out}: {counted(n_predicted, 'predicted instance')}, {n_true} ground-truth")
-
-
-def _add_claims(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "claims", call_claims)
-    parser.shared("runs", "--methods", "--device", "--format")
-    kinds = "kinds of questions, such as retrieval or property (default: all)"
-    parser.option("--question-kinds KIND...", kinds, choices=QUERY_KINDS, default=QUERY_KINDS)
-    parser.option("--out FILE", "file to write (default: print)", type=output_path)
-
-
-def call_claims(arguments: argparse.Namespace) -> None:
-    """Measure what the OpenSU3D paper claims in words: spread of similarities, largest instance, labels, sizes.
-
-    su3d-bench report claims runs/my-run
-    su3d-bench report claims runs/my-run --question-kinds relative --format latex --out claims.tex
-    """
-    from su3d_bench.analysis.claims import claims_of, claims_table
-    from su3d_bench.runs.verify import read_checked
-
-    runs = [read_checked(path) for path in arguments.runs]
-    with output.progress(sum(len(run.scenes) for run in runs), is_quiet=arguments.quiet) as report:
-        chosen = arguments.methods, arguments.question_kinds, arguments.device or "cpu"
-        found = [claims for run in runs for claims in claims_of(run, *chosen, report)]
-    output.answer_or_write(arguments, [{**vars(one), "means": one.means} for one in found], [claims_table(found)])
 
 
 def _add_leaderboard(verbs: Verbs) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,10 +16,8 @@ from su3d_bench.core.errors import (
     EXIT_CHECK_FAILED,
     EXIT_DONE,
     ConfigError,
-    ModelMissing,
     RunIncomplete,
     counted,
-    printable,
 )
 
 if TYPE_CHECKING:
@@ -45,9 +42,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--tables TABLE...", "tables of the paper (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)", type=output_path)
     parser.shared("--dry-run")
-    parser.option("--rehearse", "run on synthetic rooms in the datasets' file layouts, with embedded perception")
-    parser.option("--rooms ROOM...", "rooms of the rehearsal (default: set by the recipe)")
-    parser.option("--room-settings KEY=VALUE...", "settings of the rooms, such as n_frames=80 width=160 height=120")
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: those of the recipe)", default=[])
     parser.option(
         "--predictions METHOD=PREDICTIONS...", "predictions of several methods (not implemented here)", default=[]
     )
@@ -65,7 +60,7 @@ def call(arguments: argparse.Namespace) -> int:
     """Reproduce the experiments of a paper: runs, tables next to the published ones, and an archive.
 
     su3d-bench reproduce opensu3d --tables II III --dry-run
-    su3d-bench reproduce opensu3d --tables I II III IV V reasoning --rehearse
+    su3d-bench reproduce opensu3d --tables V --scenes replica/room0 --profile embedded --encoder embedded
     """
     from su3d_bench.reproducing.recipe import load_recipe
 
@@ -73,43 +68,8 @@ def call(arguments: argparse.Namespace) -> int:
         return _list_recipes(arguments)
     recipe = load_recipe(arguments.recipe)
     experiments = recipe.chosen(arguments.tables)
-    rehearsal = [name for name in ("rooms", "room_settings") if getattr(arguments, name)]
-    if rehearsal and not arguments.rehearse:
-        raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: needs --rehearse")
-    _check_device(arguments)
-    out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
-    _check_key(recipe, experiments, arguments, out)
-    if not arguments.rehearse:
-        return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
-    from su3d_bench.cli.rehearsal import places, rehearsed
-    from su3d_bench.reproducing.recipe import environment
-
-    asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
-    with environment(**places(out)):
-        return _reproduce(recipe, experiments, asked, out, arguments)
-
-
-def _check_key(recipe: Recipe, experiments: Sequence[Experiment], arguments: argparse.Namespace, out: Path) -> None:
-    """Raise early, before rooms are generated, if a language model is requested without a key or server."""
-    from su3d_bench.reproducing.preflight import language_needs
-    from su3d_bench.reproducing.recipe import asked_runs
-
-    for run in asked_runs(recipe, experiments, _asked(arguments)):
-        for need in () if arguments.dry_run else language_needs(run, out):
-            raise ModelMissing(need.remark)
-
-
-def _check_device(arguments: argparse.Namespace) -> None:
-    """Raise early if the GPU does not exist, except under Slurm, whose machines have their own."""
-    from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors import SLURM
-
-    if arguments.device is None:
-        return
-    if DEVICE.fullmatch(arguments.device) is None:
-        raise ConfigError(f"--device {printable(arguments.device, 40)}: {EXPECTED_DEVICE}")
-    if not arguments.dry_run and arguments.executor != SLURM:
-        device_for(arguments.device, 0)
+    out = arguments.out or Path("reproduced") / recipe.name
+    return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
 
 
 def _list_recipes(arguments: argparse.Namespace) -> int:
@@ -125,15 +85,20 @@ def _list_recipes(arguments: argparse.Namespace) -> int:
 
 def _asked(arguments: argparse.Namespace) -> RecipeRequest:
     from su3d_bench.reproducing.recipe import RecipeRequest
+    from su3d_bench.runs.scenes import split_address
 
     values = {name: getattr(arguments, name) for name in RUN_OPTIONS if getattr(arguments, name) is not None}
-    return RecipeRequest(arguments.profile, arguments.encoder, arguments.device, values, tuple(arguments.set))
+    scenes: dict[str, tuple[str, ...]] = {}
+    for address in arguments.scenes:
+        dataset, _ = split_address(address)
+        scenes[dataset] = (*scenes.get(dataset, ()), address)
+    chosen = arguments.profile, arguments.encoder, arguments.device
+    return RecipeRequest(*chosen, values=values, assignments=tuple(arguments.set), scenes=scenes or None)
 
 
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.estimate import estimate, estimate_tables
     from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
@@ -141,18 +106,15 @@ def _reproduce(
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs, out)
     if arguments.dry_run:
-        costs = estimate(runs, known)
-        value = known.to_json() | {"estimate": asdict(costs)}
-        output.answer_tables(arguments, value, [*preflight_tables(known), *estimate_tables(costs)])
+        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
     remark(*summary(known), quiet=arguments.quiet)
     if known.missing:
         first = known.missing[0]
         more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
         how = f"; get it with: {first.how}" if first.how else f"; {first.remark}" if first.remark else ""
-        ends = "" if arguments.rehearse else ", or use --rehearse"
         raise ConfigError(
-            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all{ends}"
+            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all"
         )
     folders = evaluate_predictions(named, experiments, asked, out)  # first, because it is much faster than the runs
     failures = [failure for run in runs for failure in _execute_run(run, out, arguments)]
@@ -202,5 +164,5 @@ def _answer(
     bundle = arguments.bundle or out / "bundle.zip"
     write_bundle(bundle, recipe.name, recipe_file(arguments.recipe), folders, out)
     remark(f"bundle: {bundle}", quiet=arguments.quiet)
-    where = f"SU3D_DATA={shlex.quote(os.environ['SU3D_DATA'])} " if arguments.rehearse else ""
-    remark(f"next: {where}su3d-bench report verify {shlex.quote(str(bundle))}", quiet=arguments.quiet)
+    data = ["--data", arguments.data] if arguments.data else []
+    remark(f"next: {shlex.join(['su3d-bench', 'report', 'verify', str(bundle), *data])}", quiet=arguments.quiet)

@@ -107,13 +107,10 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 def execute(plan: Plan, arguments: argparse.Namespace) -> int:
     """Run the plan, or with ``--dry-run`` print its estimated cost."""
     from su3d_bench.runs.runner import run_plan
-    from su3d_bench.store.caches import cache_warning
 
     if arguments.dry_run:
         _show_plan(plan, arguments)
         return EXIT_DONE
-    if line := cache_warning():
-        remark(f"su3d-bench: {line}", quiet=arguments.quiet)
     if arguments.out is None:
         remark(f"{counted(len(plan.jobs), 'scene')}, run folder: {plan.folder.path}", quiet=arguments.quiet)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:

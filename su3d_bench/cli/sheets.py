@@ -24,7 +24,7 @@ def add_parser(verbs: Verbs) -> None:
     """Human evaluation: create annotation sheets, score answers, and draw figures.
 
     su3d-bench sheets make runs/my-run --kinds retrieval --out sheets
-    su3d-bench sheets score ann.csv bob.xlsx --key sheets-key
+    su3d-bench sheets score ann.csv bob.csv --key sheets-key
     """
     actions = add_group(verbs, "sheets", add_parser)
     sheets_make.add_parser(actions)
@@ -34,28 +34,26 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: answers from the ground truth)")
+    parser.option("files [FILE...]", "annotators' answers, .csv (default: answers from the ground truth)")
     parser.option("--key DIR", "folder of the key: which method made what (or its key.json)", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: found near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
     parser.option("--partial", "score unfinished answers too, without the unanswered questions")
-    parser.option("--disputed FILE", "write disputed questions to this CSV file, for --exclude-ids", type=output_path)
-    parser.option("--majority", "with --disputed: without those that more than half of the annotators call right")
     parser.shared("--format")
 
 
 def call_score(arguments: argparse.Namespace) -> None:
     """Score the answers of all annotators: accuracy, tests, agreement, comparison with the ground truth.
 
-    su3d-bench sheets score ann.csv bob.xlsx --key sheets-key --out scores
-    su3d-bench sheets score ann.csv bob.csv --key sheets-key --disputed disputed.csv
+    su3d-bench sheets score ann.csv bob.csv --key sheets-key --out scores
+    su3d-bench sheets score --key sheets-key
     """
     from dataclasses import asdict
 
     from su3d_bench.formats.tables.table import Prose
     from su3d_bench.human_eval.answers import check_answers, check_key, read_answers
     from su3d_bench.human_eval.items import KEY_FILE, read_key, read_sheet
-    from su3d_bench.human_eval.scores import disputed_csv, is_right_by_majority, score
+    from su3d_bench.human_eval.scores import score
     from su3d_bench.reports.tables.judged import sheet_tables
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
@@ -63,10 +61,6 @@ def call_score(arguments: argparse.Namespace) -> None:
     sheet_file = _sheet_file(arguments, key_file, key.sheet_id)
     sheet = read_sheet(sheet_file)
     check_key(sheet, key)
-    if arguments.disputed is not None and (sheet.kind != "questions" or not arguments.files):
-        raise ConfigError("--disputed: needs the key and answers of sheets of kind questions")
-    if arguments.majority and arguments.disputed is None:
-        raise ConfigError("--majority: needs --disputed FILE")
     rows, faults = [], []
     for file in dict.fromkeys(arguments.files):
         try:
@@ -91,12 +85,6 @@ def call_score(arguments: argparse.Namespace) -> None:
             raise ConfigError(f"--out {arguments.out}: {taken.pop()} would be replaced; choose another folder")
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
-    if arguments.disputed is not None:
-        looks = [one for one in scores.review_items if one.reason != "comment"]
-        disputed = [one for one in looks if not (arguments.majority and is_right_by_majority(one))]
-        path = output.written(arguments.disputed, disputed_csv(key, disputed))
-        settled = f"; {counted(len(looks) - len(disputed), 'rating')} settled by majority" if arguments.majority else ""
-        remark(f"written: {path}{settled}", quiet=arguments.quiet)
     output.answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
 
 
@@ -153,10 +141,9 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 
 def _looks_line(scores: Scores) -> str:
     n_of = Counter(look.reason for look in scores.review_items)
-    others = "that no annotator calls right" if scores.kind == "questions" else "against the ground truth"
-    n_others = n_of["not right"] + n_of["against the truth"]
     more = f", {n_of['comment']} with only a comment" if n_of["comment"] else ""
-    return f"To review: {n_of['annotators disagree']} where annotators disagree, {n_others} {others}{more}."
+    n, n_against = n_of["annotators disagree"], n_of["against the truth"]
+    return f"To review: {n} where annotators disagree, {n_against} against the ground truth{more}."
 
 
 SUBJECTS = ("similarity", "labels", "reasoning")
@@ -181,12 +168,16 @@ def _add_pictures(verbs: Verbs) -> None:
 
 def _with_maps_to_draw(source: RunSource, arguments: argparse.Namespace) -> RunSource:
     """``source`` without the methods whose maps have nothing to draw, unless that is all; a remark names them."""
-    needed = "features" if arguments.draw == "similarity" else "instances"
-    has = source.has_features if needed == "features" else source.has_instances
-    left_out = [method for method in source.methods if not all(has(scene, method) for scene in source.scenes)]
+    by_feature = arguments.draw == "similarity"
+
+    def has_all(scene: str, method: str) -> bool:
+        return source.has_instances(scene, method) and (not by_feature or source.has_features(scene, method))
+
+    left_out = [method for method in source.methods if not all(has_all(scene, method) for scene in source.scenes)]
     drawn = [method for method in source.methods if method not in left_out] or source.methods
     if len(drawn) < len(source.methods):
         names = ", ".join(printable(method, 80) for method in left_out)
+        needed = "instances with features" if by_feature else "instances"
         remark(f"without {names}: maps without {needed} cannot be drawn", quiet=arguments.quiet)
     return source.of_methods(drawn)
 

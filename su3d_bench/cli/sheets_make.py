@@ -1,4 +1,4 @@
-"""``su3d-bench sheets make``: annotation sheets from a run or scenes, as page, table and workbook, and their key."""
+"""``su3d-bench sheets make``: annotation sheets from a run, as page and table, and their key."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import os
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output
 from su3d_bench.cli.options import Verbs, add_verb, count, output_path
@@ -14,29 +14,26 @@ from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, counted
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from su3d_bench.human_eval.drafts import Draft
-    from su3d_bench.human_eval.drawing import PictureSource
     from su3d_bench.human_eval.items import Key, SheetKind
-    from su3d_bench.human_eval.sources import RunSource, TruthSource
+    from su3d_bench.human_eval.sources import RunSource
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
 
-QUESTIONS: Final = "questions"  # the kind that needs no method and therefore no run
-KINDS = ("retrieval", "annotation", "reasoning", QUESTIONS)
+KINDS = ("retrieval", "annotation", "reasoning")
 # An annotator rates about a hundred items without a break: questions per kind and scene, instances per scene, or
 # questions per template and scene.
-
-PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
+PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1}
 
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", call, data=True)
-    parser.option("run [RUN]", "run folder (not needed for --kinds questions with --scenes)")
+    parser.shared("run")
     parser.option(
         "--kinds ...",
-        "objects found, labels and masks, answers, questions; a folder per kind if several",
+        "objects found, labels and masks, answers; a folder per kind if several",
         choices=KINDS,
         required=True,
     )
@@ -50,7 +47,6 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.shared("--methods")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: all of RUN)", default=[])
-    parser.shared("--exclude-ids")
     parser.option("--per-kind N", "maximum number per kind and scene (default: depends on the kind)", type=count)
     parser.option("--annotators N", "number of annotators (default: 1)", type=int, default=1)
     parser.option(
@@ -67,44 +63,24 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def call(arguments: argparse.Namespace) -> None:
-    """Create annotation sheets for a run or for questions: an offline page, a CSV and a workbook.
+    """Create annotation sheets for a run: an offline page and a CSV.
 
     su3d-bench sheets make runs/my-run --kinds retrieval annotation reasoning --annotators 3 --out sheets
-    su3d-bench sheets make --kinds questions --scenes 'homes/test*' --annotators 2 --overlap 1 --out sheets
+    su3d-bench sheets make runs/my-run --kinds retrieval --scenes 'homes/test*' --annotators 2 --overlap 1 --out sheets
     """
-    from su3d_bench.human_eval.sets import has_openpyxl
-    from su3d_bench.human_eval.sources import RunSource, ground_truth_of_addresses, truth_of_run
-    from su3d_bench.questions.query_files import read_excluded_ids
+    from su3d_bench.human_eval.sources import RunSource
     from su3d_bench.runs.finished import read_run
 
     _check(arguments)
-    if not arguments.dry_run and not has_openpyxl():
-        remark("without workbooks (.xlsx): they need pip install 'su3d-bench[sheets]'", quiet=arguments.quiet)
-    left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kinds))
-    origins: dict[SheetKind, Key] = {}
-    drafts: dict[SheetKind, list[Draft]] = {}
-    drawn: dict[SheetKind, list[bytes]] = {}
-    of_run = [kind for kind in kinds if kind != QUESTIONS]
-    if of_run:
-        source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
-        sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
-        if arguments.dry_run:
-            _estimate(sources["reasoning"], left_out, arguments)
-            return
-        drafts, made_by = _drafts(sources, left_out, arguments)
-        origins = {kind: _origin(kind, mine, made_by[kind]) for kind, mine in sources.items()}
-        drawn = _drawn(source, source.run.name, drafts, arguments)
-    if QUESTIONS in kinds:
-        truth = (
-            ground_truth_of_addresses(arguments.scenes)
-            if arguments.run is None
-            else truth_of_run(arguments.run, arguments.scenes)
-        )
-        of_truth, origins[QUESTIONS] = _questions(truth, left_out, arguments)
-        drafts |= of_truth
-        drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
-    written_sets = _write({kind: origins[kind] for kind in kinds}, drafts, drawn, arguments)
+    source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
+    sources = {kind: _judgeable(source, kind, arguments.quiet) for kind in kinds}
+    if arguments.dry_run:
+        _estimate(sources["reasoning"], arguments)
+        return
+    drafts, made_by = _drafts(sources, arguments)
+    origins = {kind: _origin(kind, mine, made_by[kind]) for kind, mine in sources.items()}
+    written_sets = _write(origins, drafts, _drawn(source, drafts, arguments), arguments)
     if output.answer_json(arguments, {"sets": written_sets}):
         return
     for sheet in written_sets:
@@ -115,16 +91,8 @@ def call(arguments: argparse.Namespace) -> None:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Raise ``ConfigError`` for options that do not fit together."""
-    kinds = set(arguments.kinds)
-    if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
-        raise ConfigError("RUN: name a run folder; only --kinds questions works without one, with --scenes")
-    has_questions = arguments.questions != "generated"
-    if kinds == {"annotation"} and (has_questions or arguments.exclude_ids is not None):
-        raise ConfigError("--questions, --exclude-ids: not valid for annotation sheets, which have no questions")
-    if kinds == {QUESTIONS} and (has_questions or arguments.methods):
-        raise ConfigError(
-            "--questions, --methods: not valid for --kinds questions, which uses questions from the ground truth"
-        )
+    if set(arguments.kinds) == {"annotation"} and arguments.questions != "generated":
+        raise ConfigError("--questions: not valid for annotation sheets, which have no questions")
     if arguments.question_solver == "llm" and "reasoning" not in arguments.kinds:
         raise ConfigError("--question-solver llm: needs --kinds reasoning")
     if arguments.question_solver != "llm" and (given := options.given_language_option(arguments)):
@@ -153,24 +121,8 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
     return source.of_methods(kept)
 
 
-def _questions(
-    truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
-) -> tuple[dict[SheetKind, list[Draft]], Key]:
-    """The questions to rate and their origin, with kinds instead of methods."""
-    from su3d_bench.human_eval.drafts import question_drafts
-    from su3d_bench.human_eval.items import Key
-    from su3d_bench.human_eval.scores import ANY_KIND
-    from su3d_bench.human_eval.sets import check_split
-
-    n_most = arguments.per_kind or PER_KIND[QUESTIONS]
-    drafts = [draft for scene in truth.scenes for draft in question_drafts(truth, scene, n_most, left_out)]
-    check_split(len(drafts), arguments.annotators, arguments.overlap)
-    counted_kinds = (*dict.fromkeys(draft.question_kind for draft in drafts), ANY_KIND)
-    return {QUESTIONS: drafts}, Key("", QUESTIONS, truth.run, truth.run_digest, counted_kinds, "", ())
-
-
 def _drafts(
-    sources: Mapping[SheetKind, RunSource], left_out: Collection[str], arguments: argparse.Namespace
+    sources: Mapping[SheetKind, RunSource], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], dict[SheetKind, str]]:
     """The items to rate, and per kind the solver (reasoning), the source of labels n' (annotation), or a remark on the
     encoder (retrieval).
@@ -202,11 +154,11 @@ def _drafts(
                 found = (mine.refined(scene, method) for method in mine.methods)
                 labelled_by |= dict.fromkeys(refined.source for refined in found if refined is not None)
             elif kind == "reasoning":
-                drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask, left_out)
+                drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask)
             else:
                 assert encoder is not None
                 # Use all questions of a file, unless --per-kind limits them.
-                questions = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind, left_out)
+                questions = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind)
                 drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
     for drafts in drafts_of.values():
         check_split(len(drafts), arguments.annotators, arguments.overlap)
@@ -214,7 +166,7 @@ def _drafts(
     return drafts_of, {"retrieval": note, "reasoning": answered_by, "annotation": " and ".join(labelled_by)}
 
 
-def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:
+def _estimate(source: RunSource, arguments: argparse.Namespace) -> None:
     """Print the maximum cost of the language model."""
     from su3d_bench.human_eval.drafts import reasoning_drafts, requests_into
 
@@ -223,7 +175,7 @@ def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.
     requests: list[ChatRequest] = []
     for scene in source.scenes:
         n_most = arguments.per_kind or PER_KIND["reasoning"]
-        reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config), left_out)
+        reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config))
     return options.answer_estimate(arguments, client, requests)
 
 
@@ -244,7 +196,7 @@ def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Questio
 
 
 def _drawn(
-    source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
+    source: RunSource, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.human_eval.drawing import draw_all
@@ -252,7 +204,7 @@ def _drawn(
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
     jobs = arguments.jobs or os.cpu_count() or 1
     with output.steps("pictures", is_quiet=arguments.quiet) as step:
-        pictures = draw_all(source, flat, jobs, lambda n_done, n: step(name, n_done, n))
+        pictures = draw_all(source, flat, jobs, lambda n_done, n: step(source.run.name, n_done, n))
     remaining = iter(pictures)
     return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
 

@@ -6,14 +6,12 @@ ends with a traceback if its files were damaged by a power cut, and fails on imp
 
 from __future__ import annotations
 
-import fcntl
 import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache as remembered
 from pathlib import Path
-from time import monotonic, sleep
-from typing import IO, Any
+from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
@@ -23,7 +21,6 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.files.atomic import DAMAGE
 
 _digest = remembered(digest_file)
-MAX_WAIT_S = 60.0  # wait for another process that compiles the same function; after that it is compiled here too
 UNREADABLE: tuple[type[Exception], ...] = (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
 
 
@@ -32,11 +29,7 @@ class RepairingCache(FunctionCache):
 
     Numba renames what it writes but does not sync the disk: after a power cut its files may contain anything. It also
     checks only the function's own file; here a change in a file with imported compiled functions counts too.
-    If several processes start together, one compiles and the others wait: this saves 10 % of the demo's CPU time in a
-    fresh clone.
     """
-
-    _turn: IO[bytes] | None = None
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
@@ -45,19 +38,6 @@ class RepairingCache(FunctionCache):
             self._cache_file = IndexDataCacheFile(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = self._loaded(sig, target_context)
-        if found is None and self._wait_for_turn():
-            found = self._loaded(sig, target_context)  # another process may have compiled it meanwhile
-            if found is not None:
-                self._end_turn()
-        return found
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-        self._end_turn()
-
-    def _loaded(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except UNREADABLE:
@@ -65,25 +45,9 @@ class RepairingCache(FunctionCache):
                 self.flush()  # type: ignore[no-untyped-call]
             return None
 
-    def _wait_for_turn(self) -> bool:
-        """Wait until no other process compiles this function; whether the cache should be read again."""
-        if self._turn is not None:
-            return False
-        end = monotonic() + MAX_WAIT_S
+    def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):
-            self._impl.locator.ensure_cache_path()
-            self._turn = Path(self._cache_path, f"{self._impl.filename_base}.lock").open("wb")  # noqa: SIM115
-            while monotonic() < end:
-                with suppress(BlockingIOError):
-                    fcntl.flock(self._turn, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                sleep(0.05)
-        return self._turn is not None
-
-    def _end_turn(self) -> None:
-        if self._turn is not None:
-            self._turn.close()
-            self._turn = None
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
 def imported_sources(function: Callable[..., Any]) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Read the answers of annotators from CSV files and workbooks, and measure inter-annotator agreement.
+"""Read the answers of annotators from CSV files, and measure inter-annotator agreement.
 
 Formulas are never evaluated: a formula in an answer cell is read as its text, which is not a valid answer.
 """
@@ -6,7 +6,7 @@ Formulas are never evaluated: a formula in an answer cell is read as its text, w
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -16,17 +16,14 @@ import numpy as np
 from su3d_bench.core.errors import DataError, counted, nearest, printable, some, suggest
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
 from su3d_bench.formats.arrays import read_text
-from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.table import meant, read_workbook
+from su3d_bench.formats.tables.table import meant
 from su3d_bench.human_eval.items import ANSWER_COLUMNS, COMMENT, Key, Sheet, SheetItem
 from su3d_bench.numerics.statistics import DIFFERENCE, MIN_ITEMS, jackknife_interval, leave_one_out
 from su3d_bench.questions.query_files import csv_rows
 
-MAX_BYTES = 256 << 20  # per file: a workbook contains its pictures
-MAX_TEXT_BYTES = 32 << 20  # per CSV file: some hundred thousand answers
+MAX_BYTES = 32 << 20  # per file: some hundred thousand answers
 ADVICE = "pass the files returned by the annotators, tables saved as 'CSV UTF-8'"
 MAX_CHARACTERS = 1000  # per cell
-HEADER_WITHIN = 30  # first rows of a worksheet among which the header is searched, after possible instructions
 
 
 @dataclass(frozen=True)
@@ -44,51 +41,27 @@ class AnswerRow:
 
 
 def read_answers(path: Path) -> list[AnswerRow]:
-    """All rows of a CSV file or XLSX workbook, in order; ``DataError`` if it is not an answers file."""
-    required = [name for name in ANSWER_COLUMNS if name != "annotator"]
-    rows = rows_of_file(path, ANSWER_COLUMNS, (COMMENT,))
-    return [AnswerRow(at, **cells) for at, cells in rows if any(cells[name] for name in required)]
-
-
-def rows_of_file(path: Path, columns: Sequence[str], optional: Sequence[str] = ()) -> list[tuple[str, dict[str, str]]]:
-    """Location and texts of each non-empty row of a CSV file or of each worksheet that has the ``columns``."""
+    """All non-empty rows of a CSV file, in order; ``DataError`` if it is not an answers file."""
     where = printable(str(path), 200)
-    pages: list[tuple[str, Iterable[tuple[int, Sequence[str | None]]]]]
-    if path.suffix.lower() == ".csv":
-        text = read_text(path, where, ADVICE, MAX_TEXT_BYTES)
-        pages = [(where, enumerate(csv_rows(text, where, ",;\t"), 1))]
-    elif path.suffix.lower() == ".xlsx":
-        book = read_workbook(read_bytes(path, where, ADVICE, MAX_BYTES), where)
-        pages = [(f"{where}: {printable(page.name, 60)}", page.rows) for page in book]
-    else:
-        raise DataError(f"{where}: not a .csv or .xlsx file; export a CSV from the page or save an .xlsx workbook")
-    found, has_columns = [], False
-    for place, page in pages:
-        rows = iter(page)
-        heads = (_places(row, columns, optional) for n, row in rows if n <= HEADER_WITHIN)
-        header = next(filter(None, heads), None)
-        has_columns |= header is not None
-        for number, row in rows if header else ():
-            at = f"{place}: row {number}"
-            cells = {name: _text(row[k] if k < len(row) else None, name, at) for name, k in (header or {}).items()}
-            if any(cells.values()):
-                found.append((at, cells))
-    if not has_columns:
-        raise DataError(f"{where}: missing or duplicate columns ({', '.join(columns)}); restore the header row")
+    if path.suffix.lower() != ".csv":
+        raise DataError(f"{where}: not a .csv file; {ADVICE}")
+    header, *rows = csv_rows(read_text(path, where, ADVICE, MAX_BYTES), where, ",;\t") or [[]]
+    names = [cell.strip().lower() for cell in header]
+    if any(names.count(name) != 1 for name in ANSWER_COLUMNS):
+        raise DataError(f"{where}: missing or duplicate columns ({', '.join(ANSWER_COLUMNS)}); restore the header row")
+    places = {name: names.index(name) for name in (*ANSWER_COLUMNS, COMMENT) if name in names}
+    found = []
+    for number, row in enumerate(rows, 2):
+        at = f"{where}: row {number}"
+        cells = {name: _text(row[k] if k < len(row) else "", name, at) for name, k in places.items()}
+        if any(text for name, text in cells.items() if name not in ("annotator", COMMENT)):
+            found.append(AnswerRow(at, **cells))
     return found
 
 
-def _places(row: Sequence[str | None], columns: Sequence[str], optional: Sequence[str]) -> dict[str, int] | None:
-    """Index of each column; None if the row is not the header."""
-    names = [(cell or "").strip().lower() for cell in row]
-    if any(names.count(name) != 1 for name in columns):
-        return None
-    return {name: names.index(name) for name in (*columns, *optional) if name in names}
-
-
-def _text(value: str | None, name: str, at: str) -> str:
+def _text(value: str, name: str, at: str) -> str:
     """Text of a cell without the leading mark that prevents evaluation as a formula."""
-    text = meant((value or "").strip())
+    text = meant(value.strip())
     if len(text) > MAX_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise DataError(f"{at}: '{name}' is too long or has control characters: '{printable(text, 40)}'")
     return text
@@ -229,8 +202,7 @@ class Agreement:
 
     ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the most common number. ``alpha``
     is Krippendorff's for nominal data over all items; its ``interval`` is over items and needs at least ten.
-    ``ordinal_alpha`` is for ordered answers, ``ac1`` is Gwet's. None: undefined, because there are no items or (except
-    for ``ac1``) only one answer occurs.
+    ``ac1`` is Gwet's. None: undefined, because there are no items or (except for ``ac1``) only one answer occurs.
     """
 
     n_annotators: int
@@ -242,12 +214,11 @@ class Agreement:
     n_raters: int
     alpha: float | None
     interval: Interval | None
-    ordinal_alpha: float | None = None
     ac1: float | None = None
 
 
-def agreement(ratings: Ratings, choices: Sequence[str], *, is_ordered: bool = False) -> Agreement:
-    """All coefficients for one question with these ``choices``, which may be ordered.
+def agreement(ratings: Ratings, choices: Sequence[str]) -> Agreement:
+    """All coefficients for one question with these ``choices``.
 
     Items with a single answer are ignored, except for the shares of the answers in ``ac1``.
     """
@@ -275,7 +246,6 @@ def agreement(ratings: Ratings, choices: Sequence[str], *, is_ordered: bool = Fa
         n_raters=n_raters,
         alpha=alpha,
         interval=interval,
-        ordinal_alpha=ordinal_alpha(counts) if is_ordered else None,
         ac1=gwet_ac1(every),
     )
 
@@ -343,26 +313,6 @@ def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array
     with np.errstate(invalid="ignore", divide="ignore"):
         alphas: Float64Array = np.where(expected > 0, 1.0 - observed / expected, np.nan)
     return alphas
-
-
-def ordinal_alpha(counts: Int64Array) -> float | None:
-    """Krippendorff's alpha for ordinal data [Krippendorff 2011, section D] of items (rows) by ordered answers.
-
-    The distance of two answers is the squared difference of their mean ranks among all answers. Items and None as in
-    ``krippendorff_alpha``.
-
-    >>> round(ordinal_alpha(np.array([[2, 0, 0], [0, 1, 1], [0, 0, 2], [1, 1, 0]])), 4)
-    0.7083
-    """
-    pairable = counts[counts.sum(axis=1) >= 2]
-    totals = pairable.sum(axis=0)
-    if np.count_nonzero(totals) < 2:
-        return None
-    ranks = np.cumsum(totals) - totals / 2
-    distance = np.square(ranks[:, None] - ranks)
-    sizes = pairable.sum(axis=1)
-    observed = float((np.einsum("ic,ck,ik->i", pairable, distance, pairable) / (sizes - 1)).sum())
-    return 1.0 - observed * (int(totals.sum()) - 1) / float(totals @ distance @ totals)
 
 
 def gwet_ac1(counts: Int64Array) -> float | None:

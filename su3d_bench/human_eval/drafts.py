@@ -7,21 +7,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.english import plural
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, GroundTruth
 from su3d_bench.human_eval.answers import LABELS
-from su3d_bench.human_eval.items import ASKS, RIGHT, WRONG, SheetKind
-from su3d_bench.human_eval.scores import ANY_KIND
-from su3d_bench.human_eval.sources import RunSource, TruthSource, mask_digest
+from su3d_bench.human_eval.items import RIGHT, WRONG, SheetKind
+from su3d_bench.human_eval.sources import RunSource, mask_digest
 from su3d_bench.metrics.instance.score import CoveredObjects
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions import score
@@ -29,7 +27,6 @@ from su3d_bench.metrics.questions.score import TrueAnswer
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.questions import ground_truths, model
-from su3d_bench.questions.generated import GeneratedQuestion, generate_questions
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.model import REASONING, Answer, Question, question_id
 from su3d_bench.questions.scene_map import MapObject, SceneMap
@@ -126,12 +123,8 @@ def questions_of(
     scene: str,
     given: Sequence[Question] | None,
     per_kind: int | None,
-    left_out: Collection[str] = (),
 ) -> list[Question]:
-    """The questions of four kinds for a scene: those ``given``, otherwise generated from its ground truth.
-
-    Questions whose ids are ``left_out`` are replaced by others.
-    """
+    """The questions of four kinds for a scene: those ``given``, otherwise generated from its ground truth."""
     if given is None:
         rules, truth = _known_truth(source, scene, "retrieval")
         dataset, name = source.run.dataset(scene), scene.partition("/")[2]
@@ -140,7 +133,7 @@ def questions_of(
         else:
             assert rules.min_region_size is not None
             given = generate(scene, ground_truths.scene_objects(dataset, name, truth, rules.min_region_size))
-    mine = [one for one in given if one.scene == scene and one.kind in model.KINDS and one.id not in left_out]
+    mine = [one for one in given if one.scene == scene and one.kind in model.KINDS]
     return list(chosen(mine, per_kind))
 
 
@@ -333,26 +326,19 @@ def requests_into(requests: list[ChatRequest], client: LanguageModel, config: La
 
 
 def reasoning_drafts(
-    source: RunSource,
-    scene: str,
-    given: Sequence[Question] | None,
-    per_kind: int,
-    ask: AskMap,
-    left_out: Collection[str] = (),
+    source: RunSource, scene: str, given: Sequence[Question] | None, per_kind: int, ask: AskMap
 ) -> list[Draft]:
     """The answers about each map; maps with the same answer share one draft.
 
     Uses the ``given`` questions of kind ``reasoning``, otherwise ``per_kind`` generated from the ground truth for each
-    template; without those whose ids are ``left_out``.
+    template.
     """
-
     rules = source.rules(scene, "reasoning")
-    every: Sequence[Question | TrueAnswer] = (
+    asked: Sequence[Question | TrueAnswer] = (
         _known(source, scene, per_kind)
         if given is None
         else [question for question in given if question.scene == scene and question.kind == REASONING]
     )
-    asked = [one for one in every if question_id(scene, REASONING, one.text) not in left_out]
     groups: dict[bytes, Draft] = {}
     for method in source.methods:
         instances, a_map = source.instances(scene, method), source.scene_map(scene, method)
@@ -436,59 +422,3 @@ def _judged_answer(
     if true.object_ids:
         judgements["objects"] = judged(score.are_objects_right(true, given, main))
     return judgements
-
-
-def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Collection[str] = ()) -> list[Draft]:
-    """``per_kind`` questions of each kind and each reasoning template, without those whose ids are ``left_out``.
-
-    Excluded template questions are not replaced.
-    """
-    dataset, name = source.dataset(scene), scene.partition("/")[2]
-    objects = ground_truths.scene_objects(dataset, name, source.truth(scene), ground_truths.MIN_VERTICES)
-    row_of = {instance: row for row, instance in enumerate(source.instances(scene).ids.tolist())}
-    found = [question for question in ground_truths.questions_of(dataset, name) if question.id not in left_out]
-    drafts = []
-
-    def add(asked: str, reply: str, key: str, kind: str, answers: Sequence[int], related: Sequence[int] = ()) -> None:
-        reply, names = without_ids(reply, objects, [number for number in (*answers, *related) if number in objects.ids])
-        draft = Draft(
-            kind="questions",
-            scene=scene,
-            methods=(kind, ANY_KIND),  # no method answers: results are grouped by kind
-            instance_ids=(answers[0] if len(answers) == 1 else -1,) * 2,
-            text="\n".join(printable(line, MAX_TEXT) for line in (asked, f"Answer: {reply}")),
-            asks=tuple(ask.name for ask in ASKS["questions"]),
-            question_id=key,
-            question_kind=kind,
-        )
-        drafts.append(with_answer(draft, asked, reply, (answers, related), names, row_of))
-
-    for question in chosen(found, per_kind):
-        reply = ", ".join(objects.by_id(k).shown for k in question.answers or () if k in objects.ids)
-        add(f"Find: {question.text}", reply, question.id, question.kind, question.answers or ())
-    for made in generate_questions(objects, n_each=per_kind):
-        key, answer = question_id(scene, REASONING, made.text), made.answer
-        if key not in left_out:
-            reply, related = answer.text, reference_ids(made, objects)
-            reply = "no" if answer.value is False else reply
-            add(made.text, reply, key, made.kind, answer.object_ids, related)
-    return drafts
-
-
-def reference_ids(question: GeneratedQuestion, objects: SceneMap) -> list[int]:
-    """The ids of the reference objects of an answer; for negative answers, of those with the last name in the text."""
-    ids = [one for one in question.answer.reference_ids if one in objects.ids]
-    if not ids and question.answer.value is False:
-        ids = _last_mentioned(question.text, objects)
-    return [one for one in dict.fromkeys(ids) if one not in question.answer.object_ids]
-
-
-def _last_mentioned(text: str, objects: SceneMap) -> list[int]:
-    """The ids of the objects whose name is the last in a text; "coffee table" does not match "table"."""
-    last, found, left = -1, "", text.lower()
-    for name in sorted({thing.name for thing in objects.objects if thing.name}, key=lambda name: (-len(name), name)):
-        forms = "|".join(re.escape(form.lower()) for form in (name, plural(name)))
-        for match in re.finditer(rf"\b(?:{forms})\b", left):
-            last, found = max((last, found), (match.start(), name))
-            left = left[: match.start()] + " " * len(match[0]) + left[match.end() :]
-    return [thing.id for thing in objects.objects if found and thing.name == found]

@@ -18,7 +18,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.human_eval.drafts import Draft
 from su3d_bench.human_eval.items import SHEET_KINDS
-from su3d_bench.human_eval.sources import RunSource, TruthSource, mask_digest
+from su3d_bench.human_eval.sources import RunSource, mask_digest
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.questions.model import rank_all
 from su3d_bench.questions.solver import built_in
@@ -130,13 +130,10 @@ def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
 ROOM_PHOTOS = 6  # photos of the room, for answers that name no object
 
 
-PictureSource = RunSource | TruthSource
-
-
 class Artist:
     """Draw the items of a run scene by scene; data shared by the items of a scene is computed once."""
 
-    def __init__(self, source: PictureSource) -> None:
+    def __init__(self, source: RunSource) -> None:
         self._source = source
         self._room: ShownRoom | None = None
         self._regions: dict[bytes, Region] = {}
@@ -268,12 +265,12 @@ Progress = Callable[[int, int], None]
 class SceneDrafts:
     """The work of one process: the drafts of one scene by index."""
 
-    opener: Callable[[], PictureSource]
+    opener: Callable[[], RunSource]
     drafts: Mapping[int, Draft]
 
 
 def draw_all(
-    source: PictureSource,
+    source: RunSource,
     drafts: Sequence[Draft],
     jobs: int,
     progress: Progress = lambda n_done, n: None,

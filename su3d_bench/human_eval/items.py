@@ -29,13 +29,11 @@ SCHEMA = 1
 SHEET_FILE, KEY_FILE = "sheet.json", "key.json"
 PICTURES = "pictures"  # folder of the pictures, next to sheet.json
 MAX_BYTES = 64 << 20  # of sheet.json or key.json: a hundred thousand items
-SheetKind = Literal["retrieval", "annotation", "reasoning", "questions"]
+SheetKind = Literal["retrieval", "annotation", "reasoning"]
 # Columns of an answers file; others may follow and are only for readers.
 ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
 COMMENT = "comment"  # an optional column
 RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"
-ARGUABLE = "arguable"
-VERDICTS = (RIGHT, ARGUABLE, WRONG)  # of a question: one that cannot be decided from pictures is at best arguable
 # The names in metrics/questions for the merging of a mask.
 MERGES = ("well-merged", "under-merged", "over-merged", CANNOT_TELL)
 _DIGITS = 12
@@ -125,10 +123,9 @@ class KeyItem(_Strict):
     """The source of an item: instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
 
     ``methods``: all methods with this answer, including variants such as ``opensu3d@scheme4``; ``instance_ids`` its id
-    in the map of each of them (-1 if an answer names several or none). In sheets of questions no method answers, so
-    that ``methods`` are the kind of question and ``all``. ``question_id`` and ``question_kind`` are those of the
-    question ('' in annotation sheets). ``represents``: the hidden meaning of an ask: ``{"label 1": ("n", "n'")}``.
-    ``automatic``: ask -> the correct choice according to the ground truth, if known.
+    in the map of each of them (-1 if an answer names several or none). ``question_id`` and ``question_kind`` are those
+    of the question ('' in annotation sheets). ``represents``: the hidden meaning of an ask, such as
+    ``{"label 1": ("n", "n'")}``. ``automatic``: ask -> the correct choice according to the ground truth, if known.
     """
 
     id: str
@@ -231,8 +228,8 @@ def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> R
         raise DataError(f"{where}: invalid file for su3d-bench {maker} ({place})") from error
 
 
-GUIDE = "how to judge"
-_ALONE = (
+_FOR_ALL_KINDS = (
+    f"'{CANNOT_TELL}' is for what the picture does not show; it is counted separately, not as an error.",
     "Two seconds are usually enough; your first impression counts.",
     "Judge on your own, and do not discuss items before all are done: agreement between annotators is also a result.",
 )
@@ -240,6 +237,4 @@ _ALONE = (
 
 def guide_of(sheet: Sheet) -> tuple[str, ...]:
     """The instructions at the start of a sheet."""
-    is_open = any(CANNOT_TELL in ask.choices for ask in sheet.asks)
-    unsure = (f"'{CANNOT_TELL}' is for what the picture does not show; it is counted separately, not as an error.",)
-    return (*SHEET_KINDS[sheet.kind].guide, *(unsure if is_open else ()), *_ALONE)
+    return (*SHEET_KINDS[sheet.kind].guide, *_FOR_ALL_KINDS)

@@ -18,35 +18,22 @@ from su3d_bench.core.types import Float64Array, Int64Array, Interval
 from su3d_bench.formats.tables.table import csv_lines
 from su3d_bench.human_eval import items
 from su3d_bench.human_eval.answers import LABELS, Agreement, Judgement, agreement, cohen_kappa
-from su3d_bench.human_eval.items import ARGUABLE, CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
+from su3d_bench.human_eval.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
 from su3d_bench.numerics.statistics import DIFFERENCE, MIN_ITEMS, mean_interval, share_interval, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
-from su3d_bench.questions.query_files import COLUMN
 from su3d_bench.reports.sheet.page import Entry, list_page
 
 if TYPE_CHECKING:
     import pandas
 
 
-WHOLE = "all three"
 REVIEW_COLUMNS = (
     *("item_id", "question", "reason", "answers", "truth", "comments", "scene", "methods", "text", "pictures"),
 )
-DISPUTED_COLUMNS = (COLUMN, "scene", "kind", "why", "text")
-
-
-def whole_verdicts(judgements: Iterable[Judgement], n_parts: int) -> Iterator[Judgement]:
-    """The overall judgement per annotator and question of which all ``n_parts`` are answered: the worst of them."""
-    given: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for judgement in judgements:
-        given[judgement.item_id, judgement.annotator].append(judgement.answer)
-    for (item_id, annotator), answers in given.items():
-        if len(answers) == n_parts:
-            yield Judgement(item_id, annotator, WHOLE, max(answers, key=items.VERDICTS.index))
 
 
 Judge = Literal["people", "automatic"]
-Reason = Literal["annotators disagree", "against the truth", "not right", "comment"]
+Reason = Literal["annotators disagree", "against the truth", "comment"]
 STEPS = (1, 2, 6, 12, 60)  # denominators for shares of up to 1, 2, 3, 4, 6 judges, and their differences
 MAX_STEPS = 50_000  # a distribution of 100,001 sums takes a few seconds for as many items
 ANY_KIND = "all"
@@ -54,7 +41,7 @@ LABEL_METRICS = (f"label {LABELS[0]}", f"label {LABELS[1]}")
 # The same names as in the protocols that compute these numbers from ground truth.
 METRICS = (
     *(*ALL_KINDS, ANY_KIND, *LABEL_METRICS, *MERGES[:3], *(f"{name} {LABELS[1]}" for name in MERGES[:3])),
-    *("sense", "wording", "answer", "objects", WHOLE, ARGUABLE),
+    *("answer", "objects"),
 )
 _PLACE = ["method", "dataset", "metric"]  # identifies a cell
 
@@ -126,7 +113,7 @@ class Confusion:
 
 @dataclass(frozen=True)
 class ReviewItem:
-    """An item on which annotators disagree, comment or contradict the ground truth, or a question none calls right.
+    """An item on which annotators disagree, comment or contradict the ground truth.
 
     ``automatic`` is '' if unknown; ``comments``: annotator -> text.
     """
@@ -176,8 +163,7 @@ def score(
 ) -> Scores:
     """The scores of judgements validated by ``check_answers``; without any, the ground truth's judgements of all."""
     keys = {item.id: item for item in key.items}
-    counted = [*judgements, *(whole_verdicts(judgements, len(sheet.asks)) if sheet.kind == "questions" else ())]
-    given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in counted]
+    given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in judgements]
     by_people = _shares(given)
     clear = by_people[by_people["n_clear"] > 0]
     judged = {(judgement.item_id, judgement.ask) for judgement in judgements}
@@ -187,7 +173,7 @@ def score(
         for ask, choice in item.automatic.items()
         if (item.id, ask) in judged or not judgements
     ]
-    ratings = _ratings(given, counted)
+    ratings = _ratings(given, judgements)
     return Scores(
         sheet_id=sheet.id,
         kind=sheet.kind,
@@ -220,10 +206,9 @@ def _ratings(given: Sequence[_Given], judgements: Sequence[Judgement]) -> dict[s
 
 
 def _agreement(sheet: Sheet, ratings: Mapping[str, Mapping[str, str]]) -> Agreement:
-    """The agreement on one kind of ask; only verdicts are ordered."""
+    """The agreement on one kind of ask."""
     ask = next(iter(ratings)).partition("\0")[2]
-    choices = items.VERDICTS if ask == WHOLE else sheet.ask(ask).choices
-    return agreement(ratings, choices, is_ordered=choices == items.VERDICTS)
+    return agreement(ratings, sheet.ask(ask).choices)
 
 
 def _asked(key: KeyItem, ask: str) -> str:
@@ -264,8 +249,6 @@ def _metrics(key: KeyItem, ask: str) -> list[tuple[str, str]]:
         return [(f"{name}{end}", name) for end in ends for name in MERGES[:3]]
     if ask in key.represents:
         return [(f"label {name}", RIGHT) for name in key.represents[ask]]
-    if ask == WHOLE:
-        return [(WHOLE, RIGHT), (ARGUABLE, ARGUABLE)]
     return [(ask, RIGHT)]
 
 
@@ -298,9 +281,7 @@ def _cell(judge: Judge, place: tuple[str, str, str], group: pandas.DataFrame) ->
 
 def _tests(sheet: Sheet, key: Key, clear: pandas.DataFrame) -> Iterator[PairTest]:
     """Each pair of methods under each metric over the questions asked for both; for labels, n' compared with n of each
-    method over its instances, because instances differ between methods; none for questions."""
-    if sheet.kind == "questions":
-        return
+    method over its instances, because instances differ between methods."""
     if sheet.kind == "annotation":
         left, right = LABEL_METRICS
         for method in key.methods:
@@ -411,7 +392,7 @@ def _review_items(
         for ask in item.asks:
             answers = given[item.id, ask]
             automatic = key.automatic.get(ask, "")
-            reason = _reason(sheet.kind, list(answers.values()), automatic)
+            reason = _reason(list(answers.values()), automatic)
             if reason is None and item.id in comments and ask == item.asks[0]:
                 reason = "comment"
             if reason is not None:
@@ -420,11 +401,9 @@ def _review_items(
     return looks
 
 
-def _reason(kind: items.SheetKind, answers: Sequence[str], automatic: str) -> Reason | None:
+def _reason(answers: Sequence[str], automatic: str) -> Reason | None:
     if len(set(answers)) > 1:
         return "annotators disagree"
-    if kind == "questions" and answers:
-        return None if answers[0] == RIGHT else "not right"
     is_against = bool(answers) and automatic not in ("", CANNOT_TELL) and answers[0] not in (automatic, CANNOT_TELL)
     return "against the truth" if is_against else None
 
@@ -467,23 +446,3 @@ def _entry(look: ReviewItem) -> Entry:
     comments = (f"comment, {_of_each(look.comments)}",) if look.comments else ()
     lines = (f"{look.reason}, {look.ask}: {_of_each(look.answers)}{truth}", *comments)
     return Entry(head, look.text, lines, look.pictures)
-
-
-def is_right_by_majority(look: ReviewItem) -> bool:
-    """Whether more than half of the annotators answer right, so that a tie settles nothing."""
-    return 2 * sum(answer == RIGHT for answer in look.answers.values()) > len(look.answers)
-
-
-def disputed_csv(key: Key, looks: Iterable[ReviewItem]) -> str:
-    """One line per question of ``looks``, in the format for ``--exclude-ids``, with the reason."""
-    of_item = {item.id: item for item in key.items}
-    why: dict[str, list[str]] = defaultdict(list)
-    texts: dict[str, str] = {}
-    for look in looks:
-        texts[look.item_id] = look.text
-        why[look.item_id].append(f"{look.ask}: {', '.join(sorted(set(look.answers.values())))}")
-    rows: list[tuple[str, ...]] = [DISPUTED_COLUMNS]
-    for item_id, reasons in why.items():
-        item = of_item[item_id]
-        rows.append((item.question_id, item.scene, item.question_kind, "; ".join(reasons), texts[item_id]))
-    return csv_lines(rows)

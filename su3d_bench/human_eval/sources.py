@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from su3d_bench.core import errors
-from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import ConfigError, GroundTruthMissing, printable
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Frame, GroundTruth
@@ -21,13 +19,9 @@ from su3d_bench.metrics.instance.score import CoveredObjects, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import RefinedNames
-from su3d_bench.questions.appearance import evaluated, instance_rows
-from su3d_bench.questions.ground_truths import fullest_truth
 from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.scene_map import SceneMap, map_of
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.job import build_dataset, part_of
-from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.store.predictions import read_prediction
 
 MAX_FRAMES = 32  # frames per scene among which the best view of an object is searched
@@ -162,61 +156,3 @@ def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
         total.update(np.ascontiguousarray(instances.points[instances.mask(row)]).tobytes())
         total.update(b"|")
     return total.digest()
-
-
-class TruthSource:
-    """The ground truth of ``scenes`` (``<dataset>/<scene>``); ``run`` and ``run_digest`` are empty without a run."""
-
-    def __init__(
-        self,
-        scenes: Sequence[str],
-        dataset_of: Callable[[str], Any],
-        opener: Callable[[], TruthSource] | None = None,
-        run: str = "",
-        run_digest: str = "",
-    ) -> None:
-        self.scenes, self.dataset = tuple(scenes), dataset_of
-        self.opener = opener or (lambda: self)
-        self.run, self.run_digest = run, run_digest
-        self.truth = lru_cache(maxsize=1)(self._truth)
-        self._map_of = lru_cache(maxsize=1)(self._map)
-        self.frames = lru_cache(maxsize=1)(self._frames)
-
-    def instances(self, scene: str, method: str = "") -> Instances:
-        """All ground-truth instances, independent of the method."""
-        return self._map_of(scene)
-
-    def _truth(self, scene: str) -> GroundTruth:
-        return fullest_truth(self.dataset(scene), scene.partition("/")[2])
-
-    def _map(self, scene: str) -> Instances:
-        truth = self.truth(scene)
-        rows_of = dict(instance_rows(truth, 1))
-        classes = [int(np.bincount(truth.semantic[rows].clip(min=0)).argmax()) for rows in rows_of.values()]
-        names = tuple(truth.labels.name_of(class_id) if class_id else "" for class_id in classes)
-        return Instances.of(truth.points, list(rows_of.values()), names=names, ids=list(rows_of))
-
-    def _frames(self, scene: str) -> tuple[Frame, ...]:
-        """The frames that decide which objects are visible enough for questions."""
-        dataset, name = self.dataset(scene), scene.partition("/")[2]
-        return tuple(evaluated(dataset, name))
-
-
-def truth_of_run(folder: Path, scenes: Sequence[str] = ()) -> TruthSource:
-    """The ground truth of these scenes of a run (default: all); data other than the run's are rejected."""
-    run = read_run(folder)
-    chosen = chosen_of(run, "scene", scenes, run.scenes)
-    return TruthSource(chosen, run.dataset, partial(truth_of_run, folder, chosen), run.name, run.record.code)
-
-
-def ground_truth_of_addresses(addresses: Sequence[str]) -> TruthSource:
-    """The ground truth of every scene named by an address or a pattern."""
-    settings = read_assignments((), (), ())
-    parts = {target: part_of("dataset", target, settings) for target in dataset_targets(addresses)}
-    chosen, _ = expand_scenes(addresses, parts)
-    datasets = {part.name: build_dataset(part, data_root()) for part in parts.values()}
-    return TruthSource(
-        [f"{parts[target].name}/{scene}" for target, scene in chosen],
-        lambda scene: datasets[scene.partition("/")[0]],
-        partial(ground_truth_of_addresses, [f"{target}/{scene}" for target, scene in chosen]),
-    )

@@ -28,11 +28,11 @@ from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.lexicon import Namer, NamingConfig
 from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 from su3d_bench.perception.language.chat import LanguageConfig
+from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.oracle import OracleConfig, OraclePerception
 from su3d_bench.perception.stored import NpzFiles, StoredConfig, StoredPerception
 from su3d_bench.perception.stored_masks import LabelImages
-from su3d_bench.perception.unit_costs import gpu_memory_gb
 
 PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
 # Replies of vision models, below the cache's folder, so that a rerun sends no request twice.
@@ -140,8 +140,9 @@ def models_of(profile: str, config: PerceptionConfig) -> list[str]:
 
 
 # While one process builds its map on the CPU, another uses the GPU. Kernels of different processes take turns, so a
-# third adds memory and hardly any speed: networks take most of an update's time (see unit_costs.toml).
+# third adds memory and hardly any speed: networks take most of an update's time (docs/running/gpu.md).
 MAX_PROCESSES_PER_GPU = 2
+GPU_OVERHEAD_MB = 4000  # of a process besides weights, assumed: context, SAM's attention at 1024 px, batches of crops
 
 
 def default_jobs(profile: str, config: PerceptionConfig) -> int:
@@ -150,7 +151,9 @@ def default_jobs(profile: str, config: PerceptionConfig) -> int:
     n_cores = os.cpu_count() or 1
     models = models_of(profile, config)
     memory = gpu_memory_bytes(config.models.device) if models else []
-    need = 1e9 * gpu_memory_gb(models)
+    # in float16, except for RAM++
+    weights_mb = sum(one.memory_mb(4 if one.kind == "tagger" else 2) for one in (MODELS[name] for name in models))
+    need = 1e6 * (weights_mb + GPU_OVERHEAD_MB)
     return min(n_cores, sum(max(1, min(MAX_PROCESSES_PER_GPU, int(total / need))) for total in memory) or n_cores)
 
 

@@ -10,7 +10,7 @@
 - optional, all four together: ``crop_ratios`` (R,), ``crop_features`` (K, R, D), ``global_feature`` (D,) and
   ``encoder`` (), the digest of the encoder that computed them, which must be the encoder of the run
 
-Files are plain arrays; nothing is unpickled. ``write_stored`` writes the format.
+Files are plain arrays; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.files.atomic import DAMAGE, make_folder, read_arrays, replacing
+from su3d_bench.core.files.atomic import DAMAGE, read_arrays
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, Regions, SceneInfo
@@ -170,27 +170,6 @@ class NpzFiles:
         """The detections of ``frame``; raises ``DataError``."""
         path = stored_path(self._folder, self._scene.dataset, self._scene.scene, frame.index)
         return read_stored(path, frame, self._encoder)
-
-
-def write_stored(path: Path, detections: Detections, encoder: Encoder | None) -> None:
-    """Write ``detections`` in the stored format, with their features if the ``encoder`` of them is given."""
-    n, height, width = detections.masks.shape
-    arrays: dict[str, NDArray[Any]] = {
-        "image_size": np.array([height, width], np.int64),
-        "masks": np.packbits(detections.masks.reshape(n, height * width), axis=1),
-        "boxes": detections.boxes,
-        "scores": detections.scores,
-        "names": np.array(detections.names, np.str_),
-        "captions": np.array(detections.captions, np.str_),
-    }
-    if encoder is not None:
-        arrays["crop_ratios"] = np.array(detections.crop_ratios, np.float64)
-        arrays["crop_features"] = detections.crop_features
-        arrays["global_feature"] = detections.global_feature
-        arrays["encoder"] = np.array(encoder.digest)
-    make_folder(path.parent)
-    with replacing(path) as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 
 def read_stored(path: Path, frame: Frame, encoder: Encoder) -> StoredFrame:

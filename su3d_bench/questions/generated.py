@@ -2,8 +2,7 @@
 
 Each question is about object names of the scene and has one undisputed answer: the closest object leads by a margin,
 references are single objects, pairs near a threshold are excluded, yes and no are equally frequent, and objects that no
-frame shows clearly are neither asked about nor answers. Left and right depend on the viewpoint and are only asked if an
-eye position is given.
+frame shows clearly are neither asked about nor answers. Left and right depend on the viewpoint and are not asked.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 
 from su3d_bench.core.english import is_countable, is_plural, plural, with_article, words
 from su3d_bench.core.system.files import file_text, parse_toml
-from su3d_bench.core.types import Float64Array, GroundTruth
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import PresenceQuery
 from su3d_bench.numerics.relations import FLAT_M, Relation, gap_m
@@ -69,14 +68,12 @@ class _Draft:
     part: str = ""
 
 
-def generate_questions(
-    scene: SceneMap, *, n_each: int = 5, seed: int = 0, eye: Float64Array | None = None
-) -> tuple[GeneratedQuestion, ...]:
+def generate_questions(scene: SceneMap, *, n_each: int = 5, seed: int = 0) -> tuple[GeneratedQuestion, ...]:
     """Up to ``n_each`` questions of each kind, drawn with ``seed``; the built-in solver computes the answers."""
     random = np.random.default_rng(seed)
-    solver = Solver(scene, eye)
+    solver = Solver(scene)
     questions: list[GeneratedQuestion] = []
-    for kind, drafts in _Drafts(scene, random, with_sides=eye is not None).of_kinds().items():
+    for kind, drafts in _Drafts(scene, random).of_kinds().items():
         for draft in _drawn(drafts, n_each, random):
             answer = solver.answer(draft.text)
             mentioned = [one for one in scene.objects if one.id in answer.object_ids or one.shown in answer.text]
@@ -104,10 +101,9 @@ def _drawn(drafts: Sequence[_Draft], n: int, random: Random) -> list[_Draft]:
 class _Drafts:
     """The texts of each kind for one scene."""
 
-    def __init__(self, scene: SceneMap, random: Random, *, with_sides: bool) -> None:
+    def __init__(self, scene: SceneMap, random: Random) -> None:
         self._scene = scene
         self._random = random
-        self._with_sides = with_sides
         self._all = [thing for thing in scene.objects if thing.name and not is_room_surface(thing.name)]
         hidden = {thing.name for thing in self._all if not thing.is_query_target}
         self._things = [thing for thing in self._all if thing.name not in hidden]
@@ -130,8 +126,6 @@ class _Drafts:
         for relation in ASKED_RELATIONS:
             kinds[f"what {relation}"] = partial(self._what, relation)
             kinds[f"is {relation}"] = partial(self._is, relation)
-        if self._with_sides:
-            kinds["left of"] = self._sides
         return {kind: list(drafts()) for kind, drafts in kinds.items()}
 
     def _extreme(self, sign: int) -> Iterator[_Draft]:
@@ -245,11 +239,6 @@ class _Drafts:
         """Whether the relation holds in common usage: a cushion within the box of a sofa is on it, not in it."""
         is_also_on = relation == "in" and self._scene.holds("on", a, b)
         return self._scene.is_fact(relation, a, b) and not is_also_on
-
-    def _sides(self) -> Iterator[_Draft]:
-        for a, b in combinations(self._single, 2):
-            if _away_m(a, b) < 2.0:
-                yield _Draft(f"Is the {a.name} left of the {b.name}?", 0.5, 0.5)
 
 
 def _is_counted(name: str) -> bool:

@@ -3,7 +3,7 @@
 Each has ``scene`` (``room0`` or ``replica/room0``), ``text``, and ``objects``: instance ids of the ground truth, a
 list in TOML, separated by spaces in CSV. It may have ``kind`` (instance, affordance, ...) and ``source``. Texts are
 data: anything except control characters is kept as it is. Also here: the groups in which sentences are scored
-separately (unique and multiple, easy and hard, view-dependent and not), and lists of excluded questions.
+separately (unique and multiple, easy and hard, view-dependent and not).
 """
 
 from __future__ import annotations
@@ -287,28 +287,3 @@ def _has(groups: Collection[str], pair: tuple[str, str]) -> bool:
 
 def with_group(query: TextQuery, group: str) -> TextQuery:
     return replace(query, groups=(*query.groups, group))
-
-
-COLUMN = "question_id"  # other columns are for readers only
-_ID = re.compile(r"[0-9a-f]{12}")
-
-
-def read_excluded_ids(path: Path) -> frozenset[str]:
-    """The ids in the column ``question_id``, separated by ``,`` ``;`` or tab, as spreadsheets save it too."""
-    where = printable(str(path), 200)
-    text = read_text(path, where, "pass a CSV file written by sheets score --disputed", MAX_BYTES)
-    rows = csv_rows(text, where, ",;\t")
-    header = [word.strip() for word in rows[0]] if rows else []
-    if header.count(COLUMN) != 1:
-        raise DataError(f"{where}: the first line must name one column {COLUMN}, as sheets score --disputed writes it")
-    place = header.index(COLUMN)
-    found = set[str]()
-    for number, row in enumerate(rows[1:], 2):
-        question = row[place].strip() if place < len(row) else ""
-        if any(row) and not _ID.fullmatch(question):
-            raise DataError(
-                f"{where}: row {number}: '{printable(question, 40)}' is not a question id; use the file of sheets "
-                "score --disputed"
-            )
-        found |= {question} if any(row) else set()
-    return frozenset(found)

@@ -14,20 +14,20 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.core.files.atomic import is_file, make_folder
-from su3d_bench.core.maps import Instances
 from su3d_bench.formats.tables.table import Cell, Prose, Table, TableRow
+from su3d_bench.human_eval.drawing import Figures
+from su3d_bench.human_eval.sources import RunSource
 from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
-from su3d_bench.questions.model import rank
-from su3d_bench.reports.pictures.maps import draw_heat_map
+from su3d_bench.reports.pictures.canvas import scale_stops
+from su3d_bench.reports.pictures.figures import draw_grid
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.recipe import Experiment, Recipe, method_of_row, methods_of
-from su3d_bench.runs.finished import FinishedRun, encoder_of, read_update_times
+from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.runs.job import GENERATED_SCENES
 from su3d_bench.runs.verify import read_checked
-from su3d_bench.store.predictions import read_prediction
 
 _NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
 _ENCODER = ("perception", "models", "encoder")
@@ -371,34 +371,20 @@ def compared_json(recipe: Recipe, cells: Mapping[str, Sequence[Compared]]) -> di
     return {"schema": SCHEMA, "recipe": recipe.name, "cells": rows}
 
 
-SHOWN = 5  # instances listed below a picture
-
-
 def draw_queries(experiments: Sequence[Experiment], results: Results, out: Path, device: str) -> Iterator[Path]:
-    """One picture per text and method, of the first scene of the run; maps without instances have none."""
+    """One figure per experiment with queries: a row per text, a column per method, of the first scene of its run."""
     for experiment in experiments:
-        if not experiment.queries:
+        wanted = set(methods_of(experiment))
+        run = next((run for run in results.of(experiment).runs.values() if wanted <= set(run.methods)), None)
+        if not experiment.queries or run is None:
             continue
-        for run in results.of(experiment).runs.values():
-            if set(methods_of(experiment)) <= set(run.methods):
-                yield from _of_run(experiment, run, out / experiment.name, device)
-                break
-
-
-def _of_run(experiment: Experiment, run: FinishedRun, out: Path, device: str) -> Iterator[Path]:
-    names = [scene for scene in run.scenes if scene in experiment.scenes] or list(run.scenes[:1])
-    encoder = encoder_of(run.folder, device)
-    make_folder(out)
-    for scene in names[:1]:
-        for method in methods_of(experiment):
-            file = run.folder.job(scene, method).prediction
-            prediction = read_prediction(file) if is_file(file) else None
-            if not isinstance(prediction, Instances):
-                continue
-            for text in experiment.queries:
-                ranking = rank(prediction, text, encoder)
-                first = [(prediction.names[k], float(ranking.similarity[k])) for k in ranking.order[:SHOWN]]
-                lines = [f"{place}. {value:.3f} {name}" for place, (name, value) in enumerate(first, 1)]
-                picture = out / f"{text.replace(' ', '-')}-{method.replace('@', '-')}.png"
-                draw_heat_map(prediction, ranking.similarity, picture, f'{scene}, {method}: "{text}"', lines)
-                yield picture
+        scene = next((scene for scene in run.scenes if scene in experiment.scenes), run.scenes[0])
+        source = RunSource(run, methods_of(experiment), [scene])
+        there = [method for method in source.methods if is_file(run.folder.job(scene, method).prediction)]
+        drawn = [name for name in there if source.has_instances(scene, name) and source.has_features(scene, name)]
+        if drawn:
+            make_folder(out)
+            figures, picture = Figures(source.of_methods(drawn)), out / f"{experiment.name}.png"
+            rows = figures.similarity(experiment.queries, run.encoder(device), "paper")
+            draw_grid(picture, figures.columns, rows, scale_stops("paper"))
+            yield picture

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import fnmatch
 import json
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -111,16 +109,6 @@ class Experiment(BaseModel):
         return named.get(printed, printed)
 
 
-class Rehearsal(BaseModel):
-    """A rehearsal on procedurally generated scenes: their names, their options, and the perception backend."""
-
-    model_config = _STRICT
-
-    rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
-    settings: tuple[Word, ...] = ("n_frames=100", "width=240", "height=180")
-    profile: Literal["embedded", "oracle"] = "embedded"
-
-
 class Recipe(BaseModel):
     """A paper's experiments. ``settings``: KEY=VALUE as in ``run --set``, for all its runs."""
 
@@ -133,7 +121,6 @@ class Recipe(BaseModel):
     encoder: Word = "clip-vit-h-14"
     settings: tuple[Word, ...] = ()
     experiments: Annotated[tuple[Experiment, ...], Field(alias="experiment", min_length=1)]
-    rehearsal: Rehearsal = Rehearsal()
 
     @model_validator(mode="after")
     def _named_once(self) -> Recipe:
@@ -214,7 +201,7 @@ class RecipeRequest:
     """Options for running a recipe; None means the recipe's own value.
 
     ``values``: further values of a run by key (``jobs``, ``limit``, ``executor`` and others), ``assignments``: as in
-    ``run --set``. ``scenes``: dataset -> addresses that replace the recipe's, as in a rehearsal.
+    ``run --set``. ``scenes``: dataset -> addresses that replace the recipe's; its other datasets are not used.
     """
 
     profile: str | None = None
@@ -278,6 +265,9 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeR
         encoder = asked.encoder or experiment.encoder or recipe.encoder
         for dataset, scenes in _by_dataset(experiment, asked).items():
             parts.setdefault((dataset, encoder, experiment.stride), []).append((experiment, scenes))
+    used = {dataset for dataset, *_ in parts}
+    if foreign := next((name for name in asked.scenes or () if name not in used), None):
+        raise ConfigError(f"--scenes: no requested table uses the dataset '{printable(foreign, 60)}'")
     usual = asked.encoder or recipe.encoder
     runs = []
     for (dataset, encoder, stride), mine in parts.items():
@@ -378,21 +368,6 @@ def execute(run: RecipeRun, plan: Plan, report: Report) -> RunResult:
     return result
 
 
-@contextmanager
-def environment(**values: str) -> Iterator[None]:
-    """Set environment variables, which workers inherit, for the duration of the block."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
 @dataclass(frozen=True)
 class GivenPredictions:
     """The predictions of one method: their folder, and its encoder's text features if given."""
@@ -439,12 +414,15 @@ def evaluate_predictions(
     folders: list[Path] = []
     for method, given in named.items():
         mine = [one for one in experiments if method in one.predictions]
-        for dataset in dict.fromkeys(split_address(scene)[0] for one in mine for scene in one.scenes):
+        addresses = [_by_dataset(one, asked) for one in mine]
+        for dataset in dict.fromkeys(chain.from_iterable(addresses)):
             protocols = dict.fromkeys(name for one in mine for name in one.protocols)
             fitting = tuple(name for name in protocols if dataset in load_protocol(name).datasets)
             name = re.sub(r"[^A-Za-z0-9-]+", "-", method).strip("-").lower()
             folder = out / RUNS / f"{dataset}-predictions-{name}"
-            scenes = _scenes(mine, asked, dataset)
+            # the recipe's scenes: other predicted scenes are in none of its tables
+            own = _joined(one.get(dataset, ()) for one in addresses)
+            scenes = tuple(dict.fromkeys(scene_names(dataset, own)))
             request = Request(
                 (given.place,),
                 dataset=dataset,
@@ -455,11 +433,3 @@ def evaluate_predictions(
             evaluate_methods({method: request}, folder)
             folders.append(folder)
     return folders
-
-
-def _scenes(experiments: Sequence[Experiment], asked: RecipeRequest, dataset: str) -> tuple[str, ...]:
-    """The recipe's scenes of ``dataset``; other predicted scenes are in none of its tables."""
-    addresses = asked.scenes.get(dataset) if asked.scenes else None
-    if addresses is None:
-        addresses = tuple(scene for one in experiments for scene in one.scenes if split_address(scene)[0] == dataset)
-    return tuple(dict.fromkeys(scene_names(dataset, addresses)))

@@ -28,7 +28,7 @@ RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols",
 TYPED = shlex.join(RUN)
 HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
-    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
+    "transformers", "openai", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
 )  # fmt: skip
 # Of the 0.1 s for --help, two thirds are Python's own start.
 AT_START = (*HEAVY, "numpy", "pydantic", "rich", "multiprocessing", "zipfile", "traceback", "difflib", "hashlib")

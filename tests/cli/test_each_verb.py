@@ -54,7 +54,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "report identity": ("out", 2, "has no intermediate maps"),
     "report html": ("out --no-maps --out page.html", 0, "page.html"),
     "report instances": ("out --out samples.csv", 0, "predicted instances"),
-    "report claims": ("out --out claims.md", 0, "claims.md"),
     "report leaderboard": ("out --out board.md", 0, "board.md"),
     "report bundle": ("out --out registry/bundles/mine.zip", 0, "registry/bundles/mine.zip"),
     "report verify": ("tables.tex", 0, ""),

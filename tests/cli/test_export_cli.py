@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,9 @@ def test_invalid_request_is_a_one_line_error_and_writes_nothing(
     run_folder: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     r = run_folder
-    assert "has maps of collector, oracle; choose one with --method" in error_of(capsys, r, "--to", "openlex3d")
+    shutil.copytree("r/scenes/painted.a/oracle", "r/scenes/painted.a/second")
+    assert "has maps of collector, second; choose one with --method" in error_of(capsys, r, "--to", "openlex3d")
+    shutil.rmtree("r/scenes/painted.a/second")
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "colector")
     assert "no map of method 'colector'; did you mean 'collector'?" in message
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "collector", "--scenes", "painted/z")

@@ -47,7 +47,6 @@ CASES: dict[str, list[list[str]]] = {
     "report timing": [["RUN", "--out", "out/timing"]],
     "report html": [["RUN", "--no-maps", "--out", "out/page.html", "--title", HOSTILE]],
     "report instances": [["RUN", "--out", "out/samples.csv"]],
-    "report claims": [["RUN", "--format", form, "--out", f"out/c.{form}"] for form in ("latex", "csv", "html")],
     "report leaderboard": [["."], [".", "--format", "html", "--out", "out/board.html"]],
     "report bundle": [["RUN", "--out", "out/run.zip"],
                       ["RUN", "--out", f"out/{IN_A_PATH}.zip", "--trained-on", HOSTILE]],

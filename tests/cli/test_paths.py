@@ -15,7 +15,7 @@ from su3d_bench.cli.paths import TEXTS, check_outputs, is_output
 from su3d_bench.core.errors import ConfigError
 
 VERBS = {" ".join(words): parser for words, parser in verbs()}
-WRITTEN = ("--out", "--json", "--markdown", "--junit", "--bundle", "--disputed")
+WRITTEN = ("--out", "--json", "--markdown", "--junit", "--bundle")
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +66,7 @@ ATTACKS = {
     "ground truth": ("evaluate link --ground-truth in --json in/scene.json", "--json in/scene.json: lies in"),
     "method's file": ("run --methods in/scene.txt:Class --json hard.json", "is an input"),
     "compared run": ("compare runs/demo:a,runs/demo b --json runs/demo/new.json", "lies in"),
-    "run as folder of sheets": ("sheets make --kinds questions --scenes rooms/* --out runs/demo", "is the run folder"),
+    "run as folder of sheets": ("sheets make runs/other --kinds retrieval --out runs/demo", "is the run folder"),
     "run as data root": ("datasets make rooms --out runs/demo", "is the run folder"),
     "run in a run": ("run rooms/living0 --out runs/demo/again", "lies in the run folder"),
 }

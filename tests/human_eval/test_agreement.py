@@ -15,7 +15,6 @@ from su3d_bench.human_eval.answers import (
     fleiss_kappa,
     gwet_ac1,
     krippendorff_alpha,
-    ordinal_alpha,
 )
 
 # Fleiss 1971, Psychological Bulletin 76, table 1: 30 patients, 6 psychiatrists each, 5 diagnoses; kappa = .430
@@ -57,18 +56,6 @@ def test_krippendorffs_alpha_matches_the_published_examples(observers: tuple[str
     assert krippendorff_alpha(counts_of(*observers)) == pytest.approx(alpha, abs=5e-4)
 
 
-def test_ordinal_alpha_matches_the_published_example_and_a_hand_worked_one() -> None:
-    assert ordinal_alpha(counts_of(*WITH_GAPS)) == pytest.approx(0.815, abs=5e-4)  # Krippendorff 2011, example C
-    # totals 3, 2, 3: mean ranks 1.5, 4, 6.5; neighbours differ by 6.25, ends by 25 (squared)
-    observed, expected = 2 * 6.25 + 2 * 6.25, (2 * 3 * 2 * 6.25 + 2 * 2 * 3 * 6.25 + 2 * 3 * 3 * 25) / 7
-    hand_worked = np.array([[2, 0, 0], [0, 1, 1], [0, 0, 2], [1, 1, 0]])
-    assert ordinal_alpha(hand_worked) == pytest.approx(1 - observed / expected)
-    far, near = np.array([[2, 0, 0], [0, 0, 2], [1, 0, 1]]), np.array([[2, 0, 0], [0, 0, 2], [1, 1, 0]])
-    assert (ordinal_alpha(near) or 0) > (ordinal_alpha(far) or 0)
-    # with two answers it is the nominal coefficient
-    assert ordinal_alpha(counts_of(*BINARY)) == pytest.approx(krippendorff_alpha(counts_of(*BINARY)))
-
-
 def test_ac1_matches_the_published_examples_and_a_hand_worked_one() -> None:
     # README of the author's R package irrCAC: raw4raters (the ratings of WITH_GAPS) and 3x3abstractors
     assert gwet_ac1(counts_of(*WITH_GAPS)) == pytest.approx(0.77544, abs=5e-6)
@@ -93,10 +80,9 @@ def test_agreement_is_undefined_without_two_answers_or_items() -> None:
     assert cohen_kappa([], []) is None
     nothing = np.zeros((0, 2), np.int64)
     assert fleiss_kappa(nothing) is None
-    for coefficient in (krippendorff_alpha, ordinal_alpha, gwet_ac1):
+    for coefficient in (krippendorff_alpha, gwet_ac1):
         assert coefficient(nothing) is None
         assert coefficient(np.array([[1, 0], [0, 1]])) is None  # no item with two answers
-    assert ordinal_alpha(always) is None
 
 
 def test_all_agreement_coefficients_of_a_question() -> None:
@@ -107,7 +93,7 @@ def test_all_agreement_coefficients_of_a_question() -> None:
         "d": {"ann": "wrong", "bob": "wrong"},
         "e": {"cyn": "wrong"},
     }
-    found = agreement(ratings, ("right", "wrong"), is_ordered=True)
+    found = agreement(ratings, ("right", "wrong"))
     assert (found.n_annotators, found.n_items, found.n_equal) == (3, 4, 3)
     assert (found.n_fleiss, found.n_raters) == (3, 2)  # three items have two answers, one has three
     # of b, c, d: observed 2/3; right 1/6, wrong 5/6: by chance 26/36
@@ -119,7 +105,7 @@ def test_all_agreement_coefficients_of_a_question() -> None:
     assert (pairs["ann", "bob"].n, pairs["ann", "bob"].n_equal) == (4, 3)
     assert (pairs["ann", "cyn"].n, pairs["ann", "cyn"].kappa) == (1, None)
     # n = 9, right 4, wrong 5; disagreeing pairs of c: 2; 1 - 8 x 2 / (81 - 16 - 25)
-    assert found.alpha == found.ordinal_alpha == pytest.approx(1 - 8 * 2 / 40)
+    assert found.alpha == pytest.approx(1 - 8 * 2 / 40)
     # right: 1, 0, 1/2, 0, 0 of the five items' answers; three of four items equal
     by_chance = 2 * 0.3 * 0.7
     assert found.ac1 == pytest.approx((3 / 4 - by_chance) / (1 - by_chance))
@@ -130,7 +116,6 @@ def test_alpha_interval_is_a_jackknife_over_items() -> None:
     answers = ["rr", "ww", "rw", "rr", "ww", "rr", "wr", "rr", "ww", "rr", "rw"]
     ratings = {str(k): dict(zip("xy", both, strict=True)) for k, both in enumerate(answers)}
     found = agreement(ratings, ("r", "w"))
-    assert found.ordinal_alpha is None
     counts = np.array([[both.count("r"), both.count("w")] for both in answers])
     without = np.array([krippendorff_alpha(np.delete(counts, k, axis=0)) for k in range(11)], np.float64)
     assert found.alpha is not None

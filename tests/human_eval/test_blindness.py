@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -144,21 +143,3 @@ def test_picture_is_independent_of_map_density_and_completeness(source: RunSourc
         shown: Any = SimpleNamespace(instances=lambda *_, a_map=a_map: a_map, frames=source.frames)
         drawn.add(Artist(shown).draw(replace(draft, rows=(k,))))
     assert len(drawn) == 1
-
-
-@pytest.mark.proof
-def test_question_sheets_do_not_depend_on_maps(run: Path, tmp_path: Path) -> None:
-    bare = tmp_path / "bare" / run.name
-    shutil.copytree(run, bare, ignore=shutil.ignore_patterns("prediction*", ".cache"))
-    assert list(run.rglob("prediction*")) and not list(bare.rglob("prediction*"))
-    words = ["--kinds", "questions", "--per-kind", "1", "--jobs", "1", "--scenes", SCENE, "--quiet"]
-    made = []
-    for folder in (run, bare):
-        out = tmp_path / ("of-run" if folder == run else "of-bare")
-        assert main(["sheets", "make", str(folder), *words, "--out", str(out)]) == 0
-        made.append({str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()})
-    assert made[0].keys() == made[1].keys() and len(made[0]) > 10
-    different = [name for name in made[0] if made[0][name] != made[1][name]]
-    assert different == []
-    shown = b"".join(content for name, content in made[0].items() if name.endswith((".json", ".csv")))
-    assert not [method for method in METHODS if method.encode() in shown]

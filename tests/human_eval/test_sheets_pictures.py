@@ -30,10 +30,10 @@ from su3d_bench.runs.executors import run_processes
 TEXTS = tuple(f"thing {k}" for k in range(12))
 
 
-@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning", "questions"])
+@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
 def test_picture_of_an_item_is_small_and_shows_the_object(painted_source: RunSource, kind: Any) -> None:
     draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), rows=(1,), names=())
-    if kind in ("reasoning", "questions"):
+    if kind == "reasoning":
         draft = replace(draft, names=("chair", "sofa", "", ""), others=(0,))
     content = Artist(painted_source).draw(draft)
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)

@@ -1,4 +1,4 @@
-"""Sheets as created, filled by simulated annotators with known error rates as table and workbook, and scored."""
+"""Sheets as created, filled by simulated annotators with known error rates as tables, and scored."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import openpyxl
 import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.human_eval.drafts import Draft
 from su3d_bench.human_eval.items import CANNOT_TELL, Key, Sheet, SheetKind
-from su3d_bench.human_eval.sets import TABLE, WORKBOOK, make_sheets, write_sheets
+from su3d_bench.human_eval.sets import TABLE, make_sheets, write_sheets
 
 HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
 
@@ -42,7 +41,7 @@ def drafts(kind: SheetKind, n: int) -> list[Draft]:
     return found
 
 
-def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float, *, as_workbook: bool) -> Path:
+def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float) -> Path:
     """The file of an annotator with all answers."""
     rng = random.Random(name)
     truth = {one.id: one.automatic for one in key.items}
@@ -52,17 +51,6 @@ def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float, *, 
         others = [one for one in sheet.ask(ask).choices if one not in (right, CANNOT_TELL)]
         return rng.choice(others) if rng.random() < error_rate else right
 
-    if as_workbook:
-        path = folder / name / WORKBOOK
-        book = openpyxl.load_workbook(path)
-        page = book["answers"]
-        at = next(row for row in range(1, 10) if page.cell(row, 1).value == "item_id")
-        columns = {page.cell(at, k).value: k for k in range(1, 12)}
-        for row in range(at + 1, page.max_row + 1):
-            item, ask = (str(page.cell(row, columns[one]).value) for one in ("item_id", "question"))
-            page.cell(row, columns["answer"]).value = answer(item, ask)
-        book.save(path)
-        return path
     path = folder / name / TABLE
     table = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
     for cells in table[1:]:
@@ -80,10 +68,7 @@ def test_annotator_answers_are_scored_end_to_end(kind: Any, tmp_path: Path, caps
     folder, apart = tmp_path / "sheets" / kind, tmp_path / "sheets" / f"{kind}-key"
     write_sheets(made, folder, apart)
     rates = {"annotator-1": 0.0, "annotator-2": 0.0, "annotator-3": 0.8}
-    files = [
-        fill(made.sheet, made.key, folder, name, rate, as_workbook=name == "annotator-2")
-        for name, rate in rates.items()
-    ]
+    files = [fill(made.sheet, made.key, folder, name, rate) for name, rate in rates.items()]
     capsys.readouterr()
     assert main(["sheets", "score", *map(str, files[:2]), "--key", str(apart), "--json"]) == 0
     result = capsys.readouterr()

@@ -13,7 +13,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored import StoredConfig, read_stored, stored_path, write_stored
+from su3d_bench.perception.stored import StoredConfig, read_stored, stored_path
 
 SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
 
@@ -37,8 +37,22 @@ def detections(index: int = 40) -> Detections:
 
 
 def written(folder: Path, with_features: bool) -> Path:
+    found = detections()
+    n, height, width = found.masks.shape
+    arrays: dict[str, Any] = {
+        "image_size": np.array([height, width], np.int64),
+        "masks": np.packbits(found.masks.reshape(n, height * width), axis=1),
+        "boxes": found.boxes,
+        "scores": found.scores,
+        "names": np.array(found.names),
+        "captions": np.array(found.captions),
+    }
+    if with_features:
+        arrays |= {"crop_ratios": np.array(found.crop_ratios), "crop_features": found.crop_features}
+        arrays |= {"global_feature": found.global_feature, "encoder": np.array(CountingEncoder().digest)}
     path = stored_path(folder, "replica", "room0", 40)
-    write_stored(path, detections(), CountingEncoder() if with_features else None)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **arrays)
     return path
 
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.perception import profiles
 from su3d_bench.perception.models.loading import provider_for
-from su3d_bench.perception.unit_costs import UNIT_COSTS
-from su3d_bench.reproducing.estimate import Estimate, estimate
-from su3d_bench.reproducing.preflight import Need, Preflight, preflight
+from su3d_bench.reproducing.preflight import Need, preflight
 from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe
 
 ROOM = ["--set", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
@@ -33,29 +30,6 @@ def test_size_of_missing_data_includes_files_of_all_scenes(
     text = capsys.readouterr().out
     assert "replica-meshes" in text and "33,859,047,808" in text
     assert "9 requirements missing, about 46.30 GB to fetch" in text  # 12.44 GB of frames, 33.86 GB of meshes
-    assert "**Estimate**" in text and "| measured  |" in text and "| assumed   |" in text
-
-
-def estimated(*words: str, table: str = "V", **values: Any) -> Estimate:
-    asked = RecipeRequest(device="cuda", values=values, assignments=words)
-    recipe = load_recipe("opensu3d")
-    return estimate(asked_runs(recipe, recipe.chosen([table]), asked), Preflight(()))
-
-
-def test_estimate_follows_frames_jobs_and_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
-    one, two = estimated(jobs=1), estimated(jobs=2)
-    assert one.seconds == pytest.approx(2 * two.seconds) and two.gpu_memory_gb == pytest.approx(2 * one.gpu_memory_gb)
-    assert estimated(jobs=1, limit=5).seconds < one.seconds
-    assert (one.n_requests, one.usd) == (0, 0)
-    n_images = 8 * 50 + 5 * 42  # every 40th of 2000 and of 1647
-    captions = ("perception.paper.captions=model", "perception.language.preset=paper")
-    found = estimated(*captions, refiner="model")
-    n_labels = 13 * UNIT_COSTS["instances"].value
-    assert found.n_requests == 15 * n_images + n_labels
-    assert found.usd == pytest.approx((10 * found.input_tokens + 30 * found.output_tokens) / 1e6)
-    assert estimated("perception.language.text_model=unknown", refiner="model").usd is None
-    assert {one.basis for one in found.used.values()} == {"measured", "published", "assumed"}
 
 
 @pytest.mark.parametrize(

@@ -67,3 +67,12 @@ def test_invalid_recipe_is_a_one_line_error(tmp_path: Path, change: tuple[str, s
     with pytest.raises(ConfigError) as raised:
         load_recipe(str(file))
     assert str(raised.value).startswith("mine.toml: ") and says in str(raised.value)
+
+
+def test_given_scenes_replace_those_of_their_dataset_and_leave_out_other_datasets() -> None:
+    recipe = load_recipe("opensu3d")
+    asked = RecipeRequest(scenes={"replica": ("replica/bedroom0",)})
+    runs = asked_runs(recipe, recipe.chosen(["III", "V"]), asked)
+    assert {(run.dataset, run.scenes) for run in runs} == {("replica", ("replica/bedroom0",))}
+    with pytest.raises(ConfigError, match="--scenes: no requested table uses the dataset 'homes'"):
+        asked_runs(recipe, recipe.chosen(["III"]), RecipeRequest(scenes={"homes": ("homes/test0",)}))

@@ -6,7 +6,8 @@ from typing import Any
 
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reports.tables.run import markdown_table
+from su3d_bench.reports.tables.formats import markdown
+from su3d_bench.reports.tables.run import run_tables
 from su3d_bench.runs.job import caveat_of
 from su3d_bench.runs.summary import confidences_of
 from su3d_bench.store.records import NumbersRecord
@@ -36,7 +37,7 @@ def result(method: str = "opensu3d", **more: Any) -> dict[str, Any]:
 
 
 def table(*results: dict[str, Any], is_partial: bool = False) -> str:
-    return markdown_table({"is_partial": is_partial, "limit": 3, "results": list(results)})
+    return markdown(run_tables({"is_partial": is_partial, "limit": 3, "results": list(results)}))
 
 
 def test_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:

@@ -34,7 +34,6 @@ MORE = {
     "evaluate": "See [Predictions of other programs](evaluate.md) and [Prediction formats](formats.md).",
     "reproduce": "See [Reproduce a paper](running/reproduce.md).",
     "report tables": "`report verify` recomputes every cell.",
-    "report claims": "Definitions: [Statements of the paper](methods/paper-statements.md).",
     "report html": "See [HTML report](running/html-report.md).",
     "report leaderboard": "Runs are comparable if protocol, data and number of labels agree.",
     "dev registry add": "Entries with other rules, data, encoders or duplicate names are rejected: "

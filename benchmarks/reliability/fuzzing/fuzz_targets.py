@@ -306,18 +306,15 @@ def _bundle(folder: Path) -> Read:
     return partial(verify_bundle, folder / "a.zip")
 
 
-def _answers(name: str) -> Make:
-    def make(folder: Path) -> Read:
-        from simulated_annotators import answered, as_csv, retrieval_set, workbook
+def _answers(folder: Path) -> Read:
+    from simulated_annotators import answered, as_csv, retrieval_set
 
-        from su3d_bench.human_eval.answers import check_answers, read_answers
+    from su3d_bench.human_eval.answers import check_answers, read_answers
 
-        sheet, key = retrieval_set(4)
-        rows = answered(sheet, key, {"ann": 0.0})
-        (folder / name).write_bytes(as_csv(rows).encode() if name.endswith("csv") else workbook(rows))
-        return lambda: check_answers(sheet, read_answers(folder / name))
-
-    return make
+    sheet, key = retrieval_set(4)
+    rows = answered(sheet, key, {"ann": 0.0})
+    (folder / "ann.csv").write_text(as_csv(rows))
+    return lambda: check_answers(sheet, read_answers(folder / "ann.csv"))
 
 
 def _gsa(folder: Path) -> Read:
@@ -391,7 +388,7 @@ TARGETS = {
         Target("run", _run, ("runs/a/**/*",), 0.5),
         Target("verbs", _verbs, ("runs/a/**/*",), 0.3),
         Target("bundle", _bundle, ("a.zip",), 0.3),
-        *(Target(f"answers {name}", _answers(name), (name,)) for name in ("ann.csv", "ann.xlsx")),
+        Target("answers ann.csv", _answers, ("ann.csv",)),
         Target("gsa detections", _gsa, ("**/*.pkl.gz",), 0.5),
         Target("configuration", _config, ("run.toml",)),
         *(Target(f"archive {name}", _archive(name), (name,)) for name in ("a.zip", "a.tar.gz")),

@@ -1,19 +1,17 @@
-"""Format-independent tables: rows of cells that record the run or publication of their number; CSV and workbooks."""
+"""Format-independent tables: rows of cells that record the run or publication of their number; CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Literal
 
-from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Interval
-from su3d_bench.formats.numpy_files import ZIP_DAMAGE
 
 NOT_MEASURED = "-"
 What = Literal["value", "ceiling", "scenes"]
@@ -203,61 +201,3 @@ def meant(cell: str) -> str:
     """
     text = cell[1:] if cell[:1] == "'" and cell[1:2] in FORMULA_STARTS else cell
     return _CELL_CORRECTED.sub("", text)
-
-
-MAX_XML_BYTES = 32 << 20  # of the whole archive, besides pictures, which do not compress
-MAX_SHEET_CELLS = 2_000_000  # of all worksheets
-MAX_COLUMNS = 64  # further columns are ignored
-# What openpyxl raises for damaged workbooks, besides the errors of zipfile.
-WORKBOOK_DAMAGE = (*ZIP_DAMAGE, LookupError, TypeError, AttributeError, OSError, SyntaxError, OverflowError)
-
-Row = tuple[int, list[str | None]]  # its number, counted from 1, and its cells from column A
-
-
-@dataclass(frozen=True)
-class Worksheet:
-    """The non-empty rows of a worksheet, in the order of the file."""
-
-    name: str
-    rows: list[Row]
-
-
-def read_workbook(content: bytes, where: str) -> list[Worksheet]:
-    """Every worksheet in the order of the workbook; ``DataError``, beginning with ``where``, for any other file."""
-    try:
-        import defusedxml  # without it openpyxl would expand entities
-        import openpyxl
-    except ImportError as error:
-        raise DataError(f"{where}: reading .xlsx needs {error.name}; pip install 'su3d-bench[sheets]'") from error
-    assert openpyxl.DEFUSEDXML, defusedxml.__name__
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            n_bytes = sum(info.file_size for info in archive.infolist())
-        if n_bytes > 2 * len(content) + MAX_XML_BYTES:
-            raise DataError(f"{where}: unpacks to {n_bytes >> 20} MiB; workbooks of su3d-bench sheets make are smaller")
-        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, keep_links=False)
-        n_cells, found = 0, []
-        for sheet in book.worksheets:
-            rows: list[Row] = []
-            sheet.reset_dimensions()  # the dimensions in the file may be wrong
-            for number, cells in enumerate(sheet.iter_rows(max_row=MAX_ROWS, max_col=MAX_COLUMNS, values_only=True), 1):
-                texts = [_text(cell) for cell in cells]
-                n_cells += len(texts) - texts.count(None)
-                if n_cells > MAX_SHEET_CELLS:
-                    raise DataError(f"{where}: has more than {MAX_SHEET_CELLS} cells; a file of answers is smaller")
-                if any(text is not None for text in texts):
-                    rows.append((number, texts))
-            found.append(Worksheet(sheet.title, rows))
-        return found
-    except WORKBOOK_DAMAGE as error:
-        reason = printable(f"{type(error).__name__}: {error}", 120)
-        raise DataError(f"{where}: not a readable .xlsx file ({reason}); save the workbook as .xlsx again") from error
-
-
-def _text(value: object) -> str | None:
-    """A cell as a string: the text of a formula, a number with the digits that a spreadsheet shows."""
-    if isinstance(value, bool):
-        return str(value).upper()
-    if isinstance(value, float):
-        return f"{value:.15g}"
-    return None if value is None or value == "" else str(value)

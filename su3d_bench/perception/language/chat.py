@@ -21,12 +21,12 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator,
 from su3d_bench.core.digests import digest_bytes, digest_json
 from su3d_bench.core.files.atomic import json_text, make_folder, write_bytes, write_error, write_text
 from su3d_bench.core.files.locks import hold_folder
-from su3d_bench.core.system.files import file_text
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.perception.unit_costs import PRICES
 from su3d_bench.store.run_folder import check_no_links
 
 Purpose = Literal["caption", "refine", "ask", "judge"]
+PRICES = parse_toml(file_text(Path(__file__).with_name("prices.toml")))
 CHARACTERS_PER_TOKEN = 4  # OpenAI's rule of thumb for English
 MESSAGE_TOKENS = 8  # approximate overhead per message
 
@@ -210,7 +210,6 @@ class LanguageConfig(BaseModel):
     max_image_px: int = Field(default=768, ge=32, le=4096)
     timeout_s: Seconds = 120.0  # without a byte of the answer
     max_retries: int = Field(default=4, ge=0, le=20)  # of the client library, with growing pauses
-    max_answer_bytes: int = Field(default=1_000_000, ge=1000, le=100_000_000)
     requests_per_minute: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     max_concurrent: int = Field(default=4, ge=1, le=64)
     # This many consecutive failed requests end the command, because the server is most likely down.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_convention
+from su3d_bench.datasets.recordings.pose_convention import FLIP, Finding, _best_other, _shares
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 Reading = Callable[[Float64Array], Float64Array]
@@ -27,6 +27,10 @@ def walk(scene: str, noise: int) -> tuple[Frame, ...]:
     options = RoomOptions(width=96, height=72, n_frames=1600, noise=noise)
     frames = Rooms(Path("unused"), options).frames(scene, 10)
     return tuple(frames[position] for position in range(N_FRAMES))
+
+
+def judge_convention(frames: Sequence[Frame]) -> Finding | None:
+    return _best_other(_shares(frames))
 
 
 def read_as(frames: Sequence[Frame], reading: Reading, depth_factor: float = 1.0) -> list[Frame]:

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import openpyxl
 
 from su3d_bench.human_eval.answers import AnswerRow, check_answers, check_key
 from su3d_bench.human_eval.items import ANSWER_COLUMNS, ASKS, CANNOT_TELL, AnnotatorShare, Key, KeyItem, Sheet, new_item
@@ -99,24 +98,13 @@ def answered(sheet: Sheet, key: Key, error_rates: Mapping[str, float], seed: int
     return rows
 
 
-def as_csv(rows: Sequence[AnswerRow], separator: str = ",") -> str:
+def as_csv(rows: Sequence[AnswerRow], separator: str = ",", columns: Sequence[str] = ANSWER_COLUMNS) -> str:
     """The rows as exported by a page."""
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator)
-    writer.writerow(ANSWER_COLUMNS)
-    writer.writerows([[getattr(one, name) for name in ANSWER_COLUMNS] for one in rows])
+    writer.writerow(columns)
+    writer.writerows([[getattr(one, name) for name in columns] for one in rows])
     return text.getvalue()
-
-
-def workbook(rows: Sequence[AnswerRow], header_at: int = 1, columns: Sequence[str] = ANSWER_COLUMNS) -> bytes:
-    """The rows as a workbook, possibly with instructions above its header."""
-    book = openpyxl.Workbook()
-    for k, name in enumerate(columns, 1):
-        for number, value in enumerate((name, *(getattr(row, name) for row in rows)), header_at):
-            book.active.cell(number, k).value = value
-    stream = io.BytesIO()
-    book.save(stream)
-    return stream.getvalue()
 
 
 def both(small: tuple[Sheet, Key]) -> list[AnswerRow]:

@@ -1,4 +1,4 @@
-"""Profile and device of a rehearsal are used in every run and checked before anything is written."""
+"""Profile and device of a recipe are used in every run and checked before anything is written."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 from tiny_models import write_fetched
+from written_scenes import made_in_layout
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe, plan_of
 
-ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
-WORDS = ["reproduce", "opensu3d", "--tables", "III", "--rehearse", *ROOM, "--dry-run"]
+ROOM = ["n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
 
 
 @pytest.fixture
@@ -28,8 +28,9 @@ def test_profile_paper_runs_end_to_end_with_tiny_networks(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SU3D_MODELS", str(write_fetched(tmp_path / "models")))
-    words = [word for word in WORDS if word != "--dry-run"]
-    assert main([*words, "--out", str(out), "--profile", "paper", "--jobs", "1", "--quiet"]) == 0
+    scene = made_in_layout("replica", tmp_path / "data", *ROOM)
+    words = ["reproduce", "opensu3d", "--tables", "III", "--profile", "paper", "--jobs", "1", "--quiet"]
+    assert main([*words, "--data", str(tmp_path / "data"), "--scenes", scene, "--out", str(out)]) == 0
     cells = json.loads((out / "compared.json").read_text())["cells"]
     assert cells and all(cell["measured"] is not None for cell in cells)
     runs = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]

@@ -1,4 +1,4 @@
-"""A complete rehearsal: rooms in the datasets' layouts, runs, reported and measured values, bundle and verification."""
+"""A recipe on generated rooms in the layouts of its datasets: runs, measured values, bundle and its verification."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ from pathlib import Path
 import pytest
 from chat_server import Answered, Body, ChatServer
 from registry_bundles import Files, edit_record, read_bundle, rewrite_bundle
+from written_scenes import made_in_layout
 
 from su3d_bench.cli.main import main
 
 TABLES = ["V", "reasoning"]
-ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=80", "width=160", "height=120", "mesh_spacing_m=0.1"]
-WORDS = ["reproduce", "opensu3d", "--tables", *TABLES, "--rehearse", *ROOM, "--jobs", "1", "--quiet"]
-WORDS += ["--refiner", "model"]
+ROOM = ["n_frames=80", "width=160", "height=120", "mesh_spacing_m=0.1"]
+WORDS = ["reproduce", "opensu3d", "--tables", *TABLES, "--profile", "embedded", "--encoder", "embedded", "--jobs", "1"]
 ROOMS = ["rooms/bedroom0", "--protocols", "rooms-reasoning"]
-COMMANDS = [WORDS[:6], ["run", *ROOMS], ["ablate", *ROOMS, "--vary", "top_m=1,2"]]
+COMMANDS = [WORDS, ["run", *ROOMS], ["ablate", *ROOMS, "--vary", "top_m=1,2"]]
+
+
+def words_for(out: Path) -> list[str]:
+    """The command on the room, whose files are generated unless they exist."""
+    scenes = [made_in_layout(layout, out / "data", *ROOM) for layout in ("replica", "scannet")]
+    return [*WORDS, "--quiet", "--refiner", "model", "--data", str(out / "data"), "--scenes", *scenes]
 
 
 def last_name(body: Body) -> Answered:
@@ -29,15 +35,16 @@ def last_name(body: Body) -> Answered:
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder of a rehearsal, with the embedded profile, and labels n' by a local language model."""
+    """The folder of a recipe's results on one room, with labels n' by a local language model."""
     out = tmp_path_factory.mktemp("rehearsal")
+    words = words_for(out)
     with pytest.MonkeyPatch.context() as patch, ChatServer() as server:
         server.answer = last_name
         patch.setenv("OPENAI_BASE_URL", server.url)
         patch.setenv("SU3D_CACHE", str(out / "cache"))
-        assert main([*WORDS, "--out", str(out), "--dry-run"]) == 0
+        assert main([*words, "--out", str(out), "--dry-run"]) == 0
         assert server.n_asked == 0
-        assert main([*WORDS, "--out", str(out)]) == 0
+        assert main([*words, "--out", str(out)]) == 0
         assert server.n_asked > 0
         patch.setenv("SU3D_DATA", str(out / "data"))
         patch.setenv("OPENAI_BASE_URL", "http://127.0.0.1:9/v1")  # nothing is asked again
@@ -94,7 +101,7 @@ def test_every_printed_cell_has_a_measured_value_and_causes_of_the_difference(re
 def test_repeated_command_resumes_the_run_and_writes_an_identical_bundle(rehearsed: Path) -> None:
     before = (rehearsed / "bundle.zip").read_bytes()
     metrics = (rehearsed / "runs/replica/metrics.json").stat().st_mtime_ns
-    assert main([*WORDS, "--out", str(rehearsed)]) == 0
+    assert main([*words_for(rehearsed), "--out", str(rehearsed)]) == 0
     assert (rehearsed / "bundle.zip").read_bytes() == before
     assert (rehearsed / "runs/replica/metrics.json").stat().st_mtime_ns == metrics
 
