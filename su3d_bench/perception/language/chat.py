@@ -210,6 +210,7 @@ class LanguageConfig(BaseModel):
     max_image_px: int = Field(default=768, ge=32, le=4096)
     timeout_s: Seconds = 120.0  # without a byte of the answer
     max_retries: int = Field(default=4, ge=0, le=20)  # of the client library, with growing pauses
+    max_answer_bytes: int = Field(default=1_000_000, ge=1000, le=100_000_000)
     requests_per_minute: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     max_concurrent: int = Field(default=4, ge=1, le=64)
     # This many consecutive failed requests end the command, because the server is most likely down.

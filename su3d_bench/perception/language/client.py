@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -155,6 +156,10 @@ class _Failed(Exception):
         self.is_down = is_down
 
 
+class _TooLarge(Exception):
+    pass
+
+
 class _Message(BaseModel):
     content: str | None = None
     refusal: str | None = None
@@ -220,7 +225,10 @@ class Server:
             base_url=self._address,
             max_retries=self._config.max_retries,
             timeout=self._config.timeout_s,
-            http_client=openai.DefaultHttpxClient(follow_redirects=False),
+            default_headers={"Accept-Encoding": "identity"},
+            http_client=openai.DefaultHttpxClient(
+                event_hooks={"response": [_bounded(self._config.max_answer_bytes)]}, follow_redirects=False
+            ),
         )
 
     def _post(self, body: dict[str, Any]) -> bytes | str:
@@ -234,6 +242,8 @@ class Server:
             return self._refused_parameter(error)
         except openai.APITimeoutError:
             raise _Failed(f"no answer within {self._config.timeout_s:g} s; attempts: {n_tries}", is_down=True) from None
+        except _TooLarge as error:
+            raise _Failed(f"the answer is {error}", is_down=False) from None
         except openai.OpenAIError as error:
             reason = self._shown(str(error.__cause__ or error), 120)
             if type(error.__cause__).__name__ in ("ConnectError", "UnsupportedProtocol"):
@@ -322,6 +332,33 @@ def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:
     if "max_tokens" in dropped:
         kept["max_completion_tokens"] = body["max_tokens"]
     return kept
+
+
+def _bounded(max_bytes: int) -> Callable[[Any], None]:
+    """A hook that raises an error for a response larger than ``max_bytes`` or a compressed one."""
+
+    def hook(response: Any) -> None:
+        if response.headers.get("content-encoding", "identity") not in ("", "identity"):
+            raise _TooLarge("compressed")
+        body = response.stream
+        # The client library uses either httpx or httpx2.
+        base = sys.modules[type(response).__module__.partition(".")[0]].SyncByteStream
+
+        class Bounded(base):  # type: ignore[misc, valid-type]
+            def __iter__(self) -> Iterator[bytes]:
+                n = 0
+                for chunk in body:
+                    n += len(chunk)
+                    if n > max_bytes:
+                        raise _TooLarge(f"larger than {max_bytes:,} bytes")
+                    yield chunk
+
+            def close(self) -> None:
+                body.close()
+
+        response.stream = Bounded()
+
+    return hook
 
 
 # ---- costs

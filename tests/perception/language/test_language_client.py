@@ -91,15 +91,17 @@ def test_transient_errors_are_retried(server: ChatServer, tmp_path: Path, troubl
         (Answered(raw=b"<html>gateway</html>", kind="text/html"), "not a chat completion: '<html>"),
         (Answered(raw=b'{"choices": [{"message": {"content": 5}}]}'), "not a chat completion"),
         (Answered(usage=(10**30, 1)), "not a chat completion"),
+        (Answered(raw=b" " * 3_000_000), "larger than 100,000 bytes"),
+        (Answered(raw=b"\x1f\x8b" + bytes(100), headers={"Content-Encoding": "gzip"}), "the answer is compressed"),
         (Answered(wait_s=30), "no answer within 0.3 s; attempts: 1"),
     ],
-    ids=["refused", "redirect", "malformed", "nested", "html", "wrong-type", "usage", "hung"],
+    ids=["refused", "redirect", "malformed", "nested", "html", "wrong-type", "usage", "huge", "compressed", "hung"],
 )
 def test_invalid_response_is_a_request_failure(
     server: ChatServer, tmp_path: Path, trouble: Answered, reason: str
 ) -> None:
     server.script = [trouble]
-    reply = client(server, tmp_path, timeout_s=0.3, max_retries=0).ask(ask("x"))
+    reply = client(server, tmp_path, max_answer_bytes=100_000, timeout_s=0.3, max_retries=0).ask(ask("x"))
     assert reason in reply.failure and "\n" not in reply.failure
     assert server.n_asked == 1
 
