@@ -1,0 +1,108 @@
+"""One scene with a program that gets it frame by frame: what it is asked, and what its answers must be."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.baselines.command.pipes import FRAME, POSE, VERSION, Kind, PipedProgram
+from su3d_bench.core.errors import PredictionError, printable
+from su3d_bench.core.files.state import ARRAYS, VALUES, read_state, write_state
+from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
+
+OWN_FILES = (ARRAYS, VALUES)  # of a saved state; all others are the program's
+FORMS = {"vertices": "f4 V 3", "triangles": "i4 T 3"}
+
+
+class SceneProgram:
+    """A program on one scene; ``as_of`` is the number of the last frame in its last map, None without frames.
+
+    ``folders`` are those of the program, ``places`` the same as it sees them, which differ in a container.
+    """
+
+    def __init__(
+        self, program: PipedProgram, scene: SceneInfo, folders: Mapping[str, Path], places: Mapping[str, str]
+    ) -> None:
+        self.program, self._scene, self._folders, self._places = program, scene, folders, places
+        self._numbers: list[int] = []
+        self._n_folders = 0
+        self.as_of: int | None = None
+
+    def greet(self) -> None:
+        """Describe the scene to the program."""
+        scene, mesh = self._scene, ""
+        if (self._folders["frames"] / "mesh.ply").is_file():
+            mesh = f"{self._places['frames']}/mesh.ply"
+        values = {"version": VERSION, "dataset": printable(scene.dataset), "scene": printable(scene.scene)}
+        values |= {"image_domain": scene.image_domain, "stride": scene.stride, "seed": scene.seed}
+        values |= {"n_frames": scene.n_frames, "mesh": mesh}
+        text = "".join(f"{name} {value}\n" for name, value in values.items())
+        version = self.program.ask(Kind.HELLO, "start", text.encode())
+        if version != str(VERSION):
+            raise PredictionError(f"start: the program speaks version '{version}' of the messages, not {VERSION}")
+
+    def send(self, frame: Frame) -> None:
+        """Give the program a frame; depth that is not finite becomes 0."""
+        height, width = frame.depth_m.shape
+        depth_m = np.maximum(np.nan_to_num(frame.depth_m, posinf=0.0, neginf=0.0), 0.0).astype("<f4")
+        matrices = (*frame.intrinsics.ravel(), *frame.camera_to_world.ravel())
+        head = FRAME.pack(frame.index, frame.timestamp_s, width, height, *matrices)
+        images = (np.ascontiguousarray(image).data for image in (depth_m, frame.rgb))
+        self.program.ask(Kind.FRAME, f"frame {frame.index}", head, *images)
+        self._numbers.append(frame.index)
+
+    def map_folder(self) -> Path:
+        """The folder with the program's map of now."""
+        folder, text = self._filled(Kind.SNAPSHOT, "map")
+        if text and text not in map(str, self._numbers):
+            raise PredictionError(f"map: it is as of frame '{text}', which the program did not get")
+        self.as_of = int(text) if text else next(reversed(self._numbers), None)
+        return folder
+
+    def revise(self, poses: Mapping[int, Float64Array]) -> None:
+        """New camera-to-world poses; ``ConfigError`` if the program refuses."""
+        rows = b"".join(POSE.pack(number, *pose.ravel()) for number, pose in poses.items())
+        self.program.ask(Kind.REVISE, "revise", rows)
+
+    def save(self, folder: Path, surface: Surface | None) -> None:
+        """Write the program's state and what starts it again; ``ConfigError`` if the program refuses."""
+        state, _ = self._filled(Kind.SAVE, "save")
+        for file in sorted(state.iterdir()):
+            if file.name in OWN_FILES or not stat.S_ISREG(file.lstat().st_mode):
+                name = printable(file.name, 80)
+                raise PredictionError(f"save: '{name}' cannot be stored; write plain files, not named as {OWN_FILES}")
+            shutil.copyfile(file, folder / file.name, follow_symlinks=False)
+        scene = {one.name: getattr(self._scene, one.name) for one in fields(self._scene) if one.compare}
+        mesh = {} if surface is None else {"vertices": surface.vertices, "triangles": surface.triangles}
+        write_state(folder, {"scene": scene, "numbers": self._numbers, **mesh})
+
+    def load(self, folder: Path, numbers: list[int]) -> None:
+        """Give the program the state that it wrote to ``folder`` after these frames."""
+        files = [file for file in folder.iterdir() if file.name not in OWN_FILES]
+        self._filled(Kind.LOAD, "load", files)
+        self._numbers = numbers
+
+    def _filled(self, kind: Kind, what: str, files: Iterable[Path] = ()) -> tuple[Path, str]:
+        """A new folder with ``files``, given to the program with a request, and the answer."""
+        output = self._folders["output"]
+        for old in output.iterdir():
+            shutil.rmtree(old, ignore_errors=True)
+        self._n_folders += 1
+        name = f"{what}-{self._n_folders}"
+        (output / name).mkdir()
+        for file in files:
+            shutil.copyfile(file, output / name / file.name)
+        return output / name, self.program.ask(kind, what, f"{self._places['output']}/{name}".encode())
+
+
+def saved_scene(folder: Path) -> tuple[SceneInfo, list[int]]:
+    """The scene of a saved state, and the frames that it has; raises what ``read_state`` raises."""
+    values = read_state(folder, FORMS)
+    surface = Surface(values["vertices"], values["triangles"]) if "vertices" in values else None
+    scene = SceneInfo(**values["scene"], read_surface=None if surface is None else lambda: surface)
+    return scene, [int(number) for number in values["numbers"]]
