@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import shutil
 import stat
+import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.baselines.command.pipes import FRAME, POSE, VERSION, Kind, PipedProgram
+from su3d_bench.baselines.command import pipes
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.files.state import ARRAYS, VALUES, read_state, write_state
 from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
 
+FRAME = struct.Struct("<qdII9d16d")  # number, seconds, width, height, intrinsics, pose; then depth and colour
+POSE = struct.Struct("<q16d")  # number of the frame, and its new pose
 OWN_FILES = (ARRAYS, VALUES)  # of a saved state; all others are the program's
 FORMS = {"vertices": "f4 V 3", "triangles": "i4 T 3"}
 
@@ -26,39 +29,35 @@ class SceneProgram:
     """
 
     def __init__(
-        self, program: PipedProgram, scene: SceneInfo, folders: Mapping[str, Path], places: Mapping[str, str]
+        self, piped: pipes.PipedProgram, scene: SceneInfo, folders: Mapping[str, Path], places: Mapping[str, str]
     ) -> None:
-        self.program, self._scene, self._folders, self._places = program, scene, folders, places
+        self.piped, self._scene, self._folders, self._places = piped, scene, folders, places
         self._numbers: list[int] = []
         self._n_folders = 0
         self.as_of: int | None = None
 
     def greet(self) -> None:
         """Describe the scene to the program."""
-        scene, mesh = self._scene, ""
-        if (self._folders["frames"] / "mesh.ply").is_file():
-            mesh = f"{self._places['frames']}/mesh.ply"
-        values = {"version": VERSION, "dataset": printable(scene.dataset), "scene": printable(scene.scene)}
-        values |= {"image_domain": scene.image_domain, "stride": scene.stride, "seed": scene.seed}
-        values |= {"n_frames": scene.n_frames, "mesh": mesh}
-        text = "".join(f"{name} {value}\n" for name, value in values.items())
-        version = self.program.ask(Kind.HELLO, "start", text.encode())
-        if version != str(VERSION):
-            raise PredictionError(f"start: the program speaks version '{version}' of the messages, not {VERSION}")
+        names = [one.name for one in fields(self._scene) if one.compare]
+        lines = [f"{name} {printable(str(getattr(self._scene, name)))}" for name in names]
+        has_mesh = (self._folders["frames"] / "mesh.ply").is_file()
+        lines += [f"version {pipes.VERSION}", f"mesh {self._places['frames'] + '/mesh.ply' if has_mesh else ''}"]
+        version = self.piped.ask(pipes.HELLO, "start", "\n".join(lines).encode())
+        if version != str(pipes.VERSION):
+            raise PredictionError(f"start: the program speaks version '{version}' of the messages, not {pipes.VERSION}")
 
     def send(self, frame: Frame) -> None:
-        """Give the program a frame; depth that is not finite becomes 0."""
+        """Give the program a frame."""
         height, width = frame.depth_m.shape
-        depth_m = np.maximum(np.nan_to_num(frame.depth_m, posinf=0.0, neginf=0.0), 0.0).astype("<f4")
         matrices = (*frame.intrinsics.ravel(), *frame.camera_to_world.ravel())
         head = FRAME.pack(frame.index, frame.timestamp_s, width, height, *matrices)
-        images = (np.ascontiguousarray(image).data for image in (depth_m, frame.rgb))
-        self.program.ask(Kind.FRAME, f"frame {frame.index}", head, *images)
+        images = (np.ascontiguousarray(image).data for image in (frame.depth_m, frame.rgb))
+        self.piped.ask(pipes.FRAME, f"frame {frame.index}", head, *images)
         self._numbers.append(frame.index)
 
     def map_folder(self) -> Path:
         """The folder with the program's map of now."""
-        folder, text = self._filled(Kind.SNAPSHOT, "map")
+        folder, text = self._filled(pipes.SNAPSHOT, "map")
         if text and text not in map(str, self._numbers):
             raise PredictionError(f"map: it is as of frame '{text}', which the program did not get")
         self.as_of = int(text) if text else next(reversed(self._numbers), None)
@@ -67,11 +66,11 @@ class SceneProgram:
     def revise(self, poses: Mapping[int, Float64Array]) -> None:
         """New camera-to-world poses; ``ConfigError`` if the program refuses."""
         rows = b"".join(POSE.pack(number, *pose.ravel()) for number, pose in poses.items())
-        self.program.ask(Kind.REVISE, "revise", rows)
+        self.piped.ask(pipes.REVISE, "revise", rows)
 
     def save(self, folder: Path, surface: Surface | None) -> None:
         """Write the program's state and what starts it again; ``ConfigError`` if the program refuses."""
-        state, _ = self._filled(Kind.SAVE, "save")
+        state, _ = self._filled(pipes.SAVE, "save")
         for file in sorted(state.iterdir()):
             if file.name in OWN_FILES or not stat.S_ISREG(file.lstat().st_mode):
                 name = printable(file.name, 80)
@@ -84,20 +83,23 @@ class SceneProgram:
     def load(self, folder: Path, numbers: list[int]) -> None:
         """Give the program the state that it wrote to ``folder`` after these frames."""
         files = [file for file in folder.iterdir() if file.name not in OWN_FILES]
-        self._filled(Kind.LOAD, "load", files)
+        self._filled(pipes.LOAD, "load", files)
         self._numbers = numbers
 
-    def _filled(self, kind: Kind, what: str, files: Iterable[Path] = ()) -> tuple[Path, str]:
+    def _filled(self, kind: int, what: str, files: Iterable[Path] = ()) -> tuple[Path, str]:
         """A new folder with ``files``, given to the program with a request, and the answer."""
         output = self._folders["output"]
         for old in output.iterdir():
             shutil.rmtree(old, ignore_errors=True)
         self._n_folders += 1
-        name = f"{what}-{self._n_folders}"
-        (output / name).mkdir()
+        folder = output / f"{what}-{self._n_folders}"
+        folder.mkdir()
         for file in files:
-            shutil.copyfile(file, output / name / file.name)
-        return output / name, self.program.ask(kind, what, f"{self._places['output']}/{name}".encode())
+            shutil.copyfile(file, folder / file.name)
+        text = self.piped.ask(kind, what, f"{self._places['output']}/{folder.name}".encode())
+        if folder.is_symlink():  # in a container, to a folder of this machine
+            raise PredictionError(f"{what}: its folder was replaced by a link")
+        return folder, text
 
 
 def saved_scene(folder: Path) -> tuple[SceneInfo, list[int]]:

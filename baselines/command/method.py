@@ -183,8 +183,9 @@ class Command:
         with self._errors():
             output = self._run() if self._live is None else self._live.map_folder()
             if self._live is not None:
-                self.as_of = self._live.as_of
-                self._set_costs(self._live.program.waited_s, self._live.program.peak_bytes)
+                self.as_of, watch = self._live.as_of, self._live.piped.program.watch
+                watch.look()
+                self._set_costs(self._live.piped.waited_s, watch.peak_bytes)
             prediction = read_output(output, self._scene.scene, self.config.format)
             for remark in prediction.remarks:
                 logger.warning("%s", printable(remark))
@@ -213,7 +214,7 @@ class Command:
         live, self._live = self._live, None
         try:
             if live is not None:
-                self._end_program(live.program)
+                self._log(live.piped.end(in_order=sys.exc_info()[0] is None))  # not if the run fails or is interrupted
         finally:
             if self._scratch is not None:
                 self._scratch.close()
@@ -257,15 +258,6 @@ class Command:
             program = PipedProgram(self._folders[PIPES], self.config.timeout_s, words, **how)
             self._live = SceneProgram(program, self._scene, self._folders, places)
             self._live.greet()
-
-    def _end_program(self, program: PipedProgram) -> None:
-        try:
-            if sys.exc_info()[0] is None:  # otherwise the run fails or is interrupted
-                program.finish()
-        except Su3dError as error:
-            logger.warning("command: %s", error)
-        finally:
-            self._log(program.end())
 
     def _run(self) -> Path:
         """The folder with the program's output."""
@@ -349,7 +341,8 @@ class Command:
     def _log(self, done: Finished) -> None:
         n_bytes = done.peak_memory_bytes
         memory = "" if n_bytes is None else f"{n_bytes / 2**20:.0f} MiB "
-        logger.info("the program took %.1f s, peak memory %s(%s)", done.wall_s, memory, done.memory_source)
+        took = f"{done.wall_s:.1f} s, {done.ending}, peak memory {memory}({done.memory_source})"
+        logger.info("the program took %s", took)
         for name, text in (("stdout", done.stdout), ("stderr", done.stderr)):
             for line in text.splitlines():
                 logger.info("%s: %s", name, printable(line, 2000))

@@ -67,9 +67,7 @@ def _of_owners(arrays: Mapping[str, NDArray[Any]]) -> Instances:
     """The map of a file of other programs: for each point the number of its instance, from 0 and -1 for none."""
     if fault := array_fault(arrays):
         raise PredictionError(fault)
-    if missing := {"points", "instance"} - arrays.keys():
-        raise PredictionError(f"'{missing.pop()}' is missing")
-    points, labels = arrays["points"].astype(np.float32), arrays.get("labels")
+    points, labels = arrays.get("points", np.zeros((0, 3))).astype(np.float32), arrays.get("labels")
     names = None if labels is None else labels.tolist()
     return Instances.of(points, arrays["instance"], arrays.get("scores"), arrays.get("features"), labels=names)
 

@@ -89,7 +89,7 @@ struct Voxels : su3d::Mapper {
       }
       const auto extent_m = [&](int axis) { return double(high[axis] - low[axis] + 1) * SIZE_M; };
       const bool is_flat = extent_m(2) < 0.2 && std::min(extent_m(0), extent_m(1)) > 1;
-      labels.push_back(extent_m(2) > 1.5 ? "wall" : is_flat ? "floor" : "furniture");
+      labels.push_back(extent_m(2) > 1.5 ? "wall" : is_flat ? "floor" : "cabinet");
     }
     su3d::write_instances(folder, points, instance, labels);
     return "";
