@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.baselines.command import pipes
+from su3d_bench.baselines.command.pipes import PipedProgram
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.files.state import ARRAYS, VALUES, read_state, write_state
 from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
@@ -23,23 +24,20 @@ FORMS = {"vertices": "f4 V 3", "triangles": "i4 T 3"}
 
 
 class SceneProgram:
-    """A program on one scene; ``as_of`` is the number of the last frame in its last map, None without frames.
+    """A program on one scene.
 
     ``folders`` are those of the program, ``places`` the same as it sees them, which differ in a container.
     """
 
-    def __init__(
-        self, piped: pipes.PipedProgram, scene: SceneInfo, folders: Mapping[str, Path], places: Mapping[str, str]
-    ) -> None:
-        self.piped, self._scene, self._folders, self._places = piped, scene, folders, places
+    def __init__(self, piped: PipedProgram, scene: SceneInfo, folders: dict[str, Path], places: dict[str, str]) -> None:
+        self.piped, self._folders, self._places = piped, folders, places
+        self._values = {one.name: getattr(scene, one.name) for one in fields(scene) if one.compare}
         self._numbers: list[int] = []
         self._n_folders = 0
-        self.as_of: int | None = None
 
     def greet(self) -> None:
         """Describe the scene to the program."""
-        names = [one.name for one in fields(self._scene) if one.compare]
-        lines = [f"{name} {printable(str(getattr(self._scene, name)))}" for name in names]
+        lines = [f"{name} {printable(str(value))}" for name, value in self._values.items()]
         has_mesh = (self._folders["frames"] / "mesh.ply").is_file()
         lines += [f"version {pipes.VERSION}", f"mesh {self._places['frames'] + '/mesh.ply' if has_mesh else ''}"]
         version = self.piped.ask(pipes.HELLO, "start", "\n".join(lines).encode())
@@ -55,13 +53,12 @@ class SceneProgram:
         self.piped.ask(pipes.FRAME, f"frame {frame.index}", head, *images)
         self._numbers.append(frame.index)
 
-    def map_folder(self) -> Path:
-        """The folder with the program's map of now."""
+    def current_map(self) -> tuple[Path, int | None]:
+        """The folder with the program's map of now, and the number of the last frame in it; None without frames."""
         folder, text = self._filled(pipes.SNAPSHOT, "map")
         if text and text not in map(str, self._numbers):
             raise PredictionError(f"map: it is as of frame '{text}', which the program did not get")
-        self.as_of = int(text) if text else next(reversed(self._numbers), None)
-        return folder
+        return folder, int(text) if text else next(reversed(self._numbers), None)
 
     def revise(self, poses: Mapping[int, Float64Array]) -> None:
         """New camera-to-world poses; ``ConfigError`` if the program refuses."""
@@ -76,14 +73,12 @@ class SceneProgram:
                 name = printable(file.name, 80)
                 raise PredictionError(f"save: '{name}' cannot be stored; write plain files, not named as {OWN_FILES}")
             shutil.copyfile(file, folder / file.name, follow_symlinks=False)
-        scene = {one.name: getattr(self._scene, one.name) for one in fields(self._scene) if one.compare}
         mesh = {} if surface is None else {"vertices": surface.vertices, "triangles": surface.triangles}
-        write_state(folder, {"scene": scene, "numbers": self._numbers, **mesh})
+        write_state(folder, {"scene": self._values, "numbers": self._numbers, **mesh})
 
     def load(self, folder: Path, numbers: list[int]) -> None:
         """Give the program the state that it wrote to ``folder`` after these frames."""
-        files = [file for file in folder.iterdir() if file.name not in OWN_FILES]
-        self._filled(pipes.LOAD, "load", files)
+        self._filled(pipes.LOAD, "load", [file for file in folder.iterdir() if file.name not in OWN_FILES])
         self._numbers = numbers
 
     def _filled(self, kind: int, what: str, files: Iterable[Path] = ()) -> tuple[Path, str]:

@@ -15,14 +15,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.baselines.command.folders import (
-    ColourFormat,
-    FrameFolder,
-    as_prediction,
-    class_names,
-    read_output,
-    write_mesh,
-)
+from su3d_bench.baselines.command.folders import ColourFormat, FrameFolder, as_prediction, class_names, read_output
 from su3d_bench.baselines.command.frame_by_frame import SceneProgram, saved_scene
 from su3d_bench.baselines.command.pipes import PipedProgram
 from su3d_bench.baselines.command.placeholders import PLACEHOLDER, PLACEHOLDERS, check_placeholders, variable_of
@@ -160,10 +153,9 @@ class Command:
             logger.info("no mesh.ply for the program: %s", error)
         self._scratch = TemporaryFolder("su3d-command-")
         self._frames = FrameFolder(self._scratch.path / "frames", scene, self.config.colour, self._surface)
+        self._frames.open()
         if self.config.frame_by_frame:
             self._start_program()
-        else:
-            self._frames.open()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Gives the frame to the running program, or adds it to the folder that the program gets with ``finish``."""
@@ -181,9 +173,11 @@ class Command:
         if self._live is None:
             self._frames.close()
         with self._errors():
-            output = self._run() if self._live is None else self._live.map_folder()
-            if self._live is not None:
-                self.as_of, watch = self._live.as_of, self._live.piped.program.watch
+            if self._live is None:
+                output = self._run()
+            else:
+                output, self.as_of = self._live.current_map()
+                watch = self._live.piped.program.watch
                 watch.look()
                 self._set_costs(self._live.piped.waited_s, watch.peak_bytes)
             prediction = read_output(output, self._scene.scene, self.config.format)
@@ -250,9 +244,7 @@ class Command:
     def _start_program(self) -> None:
         assert self._scene is not None
         for folder in self._folders.values():
-            folder.mkdir()
-        if self._surface is not None:
-            write_mesh(self._folders["frames"] / "mesh.ply", self._surface)
+            folder.mkdir(exist_ok=True)
         with self._errors():
             words, places, how = self._command()
             program = PipedProgram(self._folders[PIPES], self.config.timeout_s, words, **how)
@@ -334,9 +326,8 @@ class Command:
         return [*words, self.config.image]
 
     def _set_costs(self, program_s: float, peak_bytes: int | None) -> None:
-        self.finish_costs = {"program_s": round(program_s, 3)}
-        if peak_bytes is not None:
-            self.finish_costs["program_peak_bytes"] = peak_bytes
+        peak = {} if peak_bytes is None else {"program_peak_bytes": peak_bytes}
+        self.finish_costs = {"program_s": round(program_s, 3), **peak}
 
     def _log(self, done: Finished) -> None:
         n_bytes = done.peak_memory_bytes

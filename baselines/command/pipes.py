@@ -60,15 +60,13 @@ class PipedProgram:
             raise PredictionError(self._fault)
         self._fault, start = f"{what}: was interrupted", time.perf_counter()
         self._n_asked += 1
-        limit_s = min(self._timeout_s, FINISH_S) if kind == FINISH else self._timeout_s
+        until = start + min(self._timeout_s, FINISH_S if kind == FINISH else self._timeout_s)
         parts = [memoryview(part).cast("B") for part in content]
         header = HEADER.pack(MAGIC, kind, self._n_asked, sum(map(len, parts)))
         try:
             for part in (memoryview(header), *parts):
-                self._send(part, start + limit_s)
-            answer, text = self._receive_answer(start + limit_s)
-        except TimeoutError:
-            self._fail(what, f"no complete answer within {limit_s:g} s (timeout_s)")
+                self._send(part, until)
+            answer, text = self._receive_answer(until)
         except _BrokenError as error:
             self._fail(what, str(error))
         finally:
@@ -140,5 +138,5 @@ class PipedProgram:
             if has_ended:
                 raise _BrokenError
             if left_s <= 0:
-                raise TimeoutError
+                raise _BrokenError(f"no complete answer within {self._timeout_s:g} s (timeout_s)")
             self.program.watch.look()

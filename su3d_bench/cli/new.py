@@ -88,8 +88,8 @@ def _new_program(folder: Path, arguments: argparse.Namespace) -> None:
         raise ConfigError(f"methods new: {folder} exists; choose another folder")
     for name in PROGRAM_FILES:
         written(folder / name.removesuffix(".txt"), file_text(TEMPLATES / "program" / name))
-    word = f'command.command=["python", "{folder}/voxels.py"]'
-    command = f"su3d-bench run --scenes homes/tuning0 --methods command --set command.frame_by_frame=true '{word}'"
+    words = f"""command.frame_by_frame=true 'command.command=["python", "{folder}/voxels.py"]'"""
+    command = f"su3d-bench run --scenes homes/tuning0 --methods command --set {words}"
     lines = (f"{folder}: clients and examples in Python and C++; then:", f"  {command}")
     answer_either(arguments, {"file": str(folder), "next": [command]}, *lines)
 

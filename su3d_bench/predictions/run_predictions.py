@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files.atomic import write_npz
-from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.formats.arrays import array_of
 from su3d_bench.formats.numpy_files import map_npy, npz_names, read_npz
@@ -54,10 +54,8 @@ def stored_prediction(place: Path, scene: str) -> Parsed:
             raise PredictionError(f"{shown(file)}: stores its table column by column; copy it again")
         arrays["features"] = table
     with named(where):
-        if str(arrays.get("kind")) == Instances.__name__ and "instance" in arrays:
-            content: Prediction = _of_owners(arrays)
-        else:
-            content = prediction_from_arrays(arrays, where)
+        is_short = str(arrays.get("kind")) == Instances.__name__ and "instance" in arrays
+        content = _of_owners(arrays) if is_short else prediction_from_arrays(arrays, where)
         if fault := value_fault(content):
             raise PredictionError(f"{fault}; run the scene again")
     return content, ()

@@ -6,9 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,6 @@ from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.errors import ConfigError, PredictionError, Su3dError
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.types import Frame, SceneInfo
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.store.run_folder import RunFolder
 
@@ -59,14 +56,6 @@ def command_of(programs: Path, language: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def room(rooms_data: Path) -> tuple[SceneInfo, Sequence[Frame]]:
-    dataset_class = registry.load("dataset", "rooms")
-    dataset = dataset_class(rooms_data, dataset_class.Options(**SMALL))
-    info = replace(dataset.info("bathroom0", STRIDE), read_surface=partial(dataset.surface, "bathroom0"))
-    return info, list(dataset.frames("bathroom0", STRIDE))
-
-
-@pytest.fixture(scope="module")
 def expected(programs: Path, rooms_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The map of a run of the example in Python."""
     return run_of(command_of(programs, "python"), rooms_data, tmp_path_factory.mktemp("run"))
@@ -92,24 +81,22 @@ def test_program_in_c_plus_plus_gives_the_same_map_as_in_python(
 
 @pytest.mark.parametrize("language", ["python", "c++"])
 def test_session_equals_run_also_saved_and_continued(
-    language: str, programs: Path, expected: Instances, room: tuple[SceneInfo, Sequence[Frame]], tmp_path: Path
+    language: str, programs: Path, expected: Instances, rooms_data: Path, tmp_path: Path
 ) -> None:
-    info, shots = room
+    dataset_class = registry.load("dataset", "rooms")
+    dataset = dataset_class(rooms_data, dataset_class.Options(**SMALL))
+    info, shots = dataset.info("bathroom0", STRIDE), list(dataset.frames("bathroom0", STRIDE))
     settings = {"command": command_of(programs, language), "frame_by_frame": True}
-    with su3d.session("command", info, settings=settings) as s:
-        for frame in shots[:3]:
-            s.push(frame)
+    with su3d.session("command", replace(info, read_surface=lambda: SURFACE), settings=settings) as s:
+        list(map(s.push, shots[:3]))
         s.save(tmp_path / "half")
         with pytest.raises(ConfigError, match="refuses: it has no revise"):
             s.revise({0: np.eye(4)})
-        for frame in shots[3:]:
-            s.push(frame)
+        list(map(s.push, shots[3:]))
         assert_same(s.snapshot().prediction, expected)
-        assert s.snapshot().as_of.geometry == shots[-1].index
     with su3d.session(load=tmp_path / "half") as s:
         assert s.snapshot().as_of.geometry == shots[2].index
-        for frame in shots[3:]:
-            s.push(frame)
+        list(map(s.push, shots[3:]))
         assert_same(s.snapshot(wait=False).result().prediction, expected)
 
 
@@ -149,15 +136,12 @@ def test_snapshot_names_its_last_frame_and_poses_can_be_revised(
     (tmp_path / "behind.py").write_text(BEHIND)
     settings = {"command": [sys.executable, str(tmp_path / "behind.py"), str(programs)], "frame_by_frame": True}
     with su3d.session("command", replace(SCENE, read_surface=lambda: SURFACE), settings=settings) as s:
-        for frame in frames():
-            s.push(frame)
+        list(map(s.push, frames()))
         assert (s.as_of.geometry, s.snapshot().as_of.geometry, s.snapshot(wait=False).as_of.geometry) == (2, 1, 1)
         with pytest.raises(ConfigError, match="revise: the program refuses: no frame 99"):
             s.revise({99: np.eye(4)})
-        pose = np.eye(4)
-        pose[:3, 3] = 7, 8, 9
-        s.revise({1: pose})
-        assert s.snapshot().prediction.points[2].tolist() == [7, 8, 9]
+        s.revise({1: 3 * np.eye(4) + np.eye(4, k=3)})
+        assert s.snapshot().prediction.points[2].tolist() == [1, 0, 0]
         with pytest.raises(ConfigError, match="save: the program refuses: it has no save"):
             s.save(tmp_path / "saved")
     assert "stdout: a print of a b with mesh" in caplog.text
@@ -189,21 +173,19 @@ WRONG = """
 import os, struct, sys, time
 how, pids = sys.argv[1:]
 open(pids, "a").write(f"{os.getpid()} ")
-header = struct.Struct("<4sIQQ")
 requests = open(os.environ["SU3D_PIPES"] + "/requests", "rb")
 answers = open(os.environ["SU3D_PIPES"] + "/answers", "wb", buffering=0)
 def answer(kind, number, text=b"", n_bytes=None):
-    answers.write(header.pack(b"SU3D", kind, number, len(text) if n_bytes is None else n_bytes) + text)
+    answers.write(struct.pack("<4sIQQ", b"SU3D", kind, number, len(text) if n_bytes is None else n_bytes) + text)
 while True:
-    _, kind, number, n_bytes = header.unpack(requests.read(24))
+    _, kind, number, n_bytes = struct.unpack("<4sIQQ", requests.read(24))
     requests.read(n_bytes)
     print("a print", flush=True)
     print("request", number, file=sys.stderr, flush=True)
     if number == 4:
         exec(how)
     answer(100, number, b"1" if kind == 1 else b"")
-    if kind == 7:
-        sys.exit(6)
+    assert kind != 7
 """
 HANG = "time.sleep(60)"
 AT_2 = "rooms/a b: command: frame 2: "
@@ -217,9 +199,7 @@ AT_2 = "rooms/a b: command: frame 2: "
             f"{AT_2}exit code 1 before its answer; its last line: RuntimeError: no mem",
         ),
         ("os.kill(os.getpid(), 9)", f"{AT_2}terminated by signal 9 before its answer; its last line: request 4"),
-        ("sys.exit(0)", f"{AT_2}exit code 0 before its answer; its last line: request 4"),
         ("answer(102, number, b'no \\x1b[31mGPU\\n'); sys.exit(3)", f"{AT_2}error of the program: no \\x1b[31mGPU"),
-        ("answer(101, number, b'busy')", f"{AT_2}error of the program: busy"),
         ("answer(100, number, b'', 1 << 62)", f"{AT_2}its answer has {1 << 62} bytes; at most 4096; its last line"),
         (
             f"answer(100, number, b'', 5); {HANG}",
@@ -231,43 +211,24 @@ AT_2 = "rooms/a b: command: frame 2: "
         (f"answers.close(); {HANG}", f"{AT_2}it closed its pipe before its answer; its last line: request 4"),
         (f"os.fork() or {HANG}; sys.exit(5)", f"{AT_2}exit code 5 before its answer"),
         ("pass", "it reports no error but wrote nothing to {output}"),
+        ("$ no-such-interpreter,x.py", "command: 'no-such-interpreter' cannot be started: No such file"),
+        ("$ sh,-c,echo hi; echo no licence >&2", "start: exit code 0 before its answer; its last line: no licence"),
+        ("$ sleep,60", "start: no complete answer within 2 s (timeout_s); it wrote nothing to stderr"),
     ],
 )
 def test_every_failure_is_one_line_and_leaves_no_process(how: str, line: str, tmp_path: Path) -> None:
+    pids = tmp_path / "pids"
+    pids.touch()
     (tmp_path / "wrong.py").write_text(WRONG)
-    words = (sys.executable, str(tmp_path / "wrong.py"), how, str(tmp_path / "pids"))
+    words = tuple(how[2:].split(",")) if how[:2] == "$ " else (sys.executable, f"{tmp_path}/wrong.py", how, str(pids))
     one = Command(CommandConfig(command=words, frame_by_frame=True, timeout_s=2.0))
-    with pytest.raises(PredictionError) as caught:
+    with pytest.raises(Su3dError) as caught:
         fed(one, None).finish()
     assert line in str(caught.value)
     scratch = one._scratch
-    assert scratch is not None
     one.close()
-    assert not scratch.path.exists()
-    (pid,) = map(int, (tmp_path / "pids").read_text().split())
-    wait_until(lambda: not psutil.pid_exists(pid), "the program is still running")
-
-
-@pytest.mark.parametrize(
-    ("command", "line"),
-    [
-        (("no-such-interpreter", "x.py"), "command: 'no-such-interpreter' cannot be started: No such file"),
-        (("sh", "-c", "echo hi; echo no licence >&2"), "start: exit code 0 before its answer; its last line: no lic"),
-        (("sh", "-c", "sleep 60"), "start: no complete answer within 1 s (timeout_s); it wrote nothing to stderr"),
-    ],
-)
-def test_program_that_does_not_answer_at_the_start_is_one_line(command: tuple[str, ...], line: str) -> None:
-    settings = {"command": list(command), "frame_by_frame": True, "timeout_s": 1.0}
-    with pytest.raises(Su3dError) as caught:
-        su3d.session("command", SCENE, settings=settings)
-    assert line in str(caught.value)
-
-
-def test_command_without_frame_by_frame_cannot_be_saved_or_revised(tmp_path: Path) -> None:
-    with su3d.session("command", SCENE, settings={"command": "true"}) as s:
-        for call in (partial(s.save, tmp_path / "saved"), partial(s.revise, {0: np.eye(4)})):
-            with pytest.raises(ConfigError, match="unless frame_by_frame = true"):
-                call()
+    assert scratch is not None and not scratch.path.exists()
+    wait_until(lambda: not any(psutil.pid_exists(int(pid)) for pid in pids.read_text().split()), "it still runs")
 
 
 def test_container_gets_the_pipes_read_only(programs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,7 +251,7 @@ sys.argv = ["", os.environ["CLIENT"]]
     assert len(one.finish().points) == 3
     one.close()
     words = json.loads(log.read_text().splitlines()[0])
-    assert any(word.endswith("/pipes:/su3d/pipes:ro") for word in words) and "SU3D_PIPES" in words
+    assert any(word.endswith("/pipes:/su3d/pipes:ro") for word in words)
 
 
 def test_instances_without_all_arrays_are_read_and_checked(tmp_path: Path) -> None:
@@ -299,12 +260,6 @@ def test_instances_without_all_arrays_are_read_and_checked(tmp_path: Path) -> No
     found = recognise(file).read(file, "prediction").content
     assert isinstance(found, Instances) and found.labels == ("a", "b")
     assert [mask.tolist() for mask in found.sets()] == [[2], [0]] and found.scores.tolist() == [0.5, 1.0]
-    for arrays, fault in (
-        ({"points": points, "instance": [2, -1, 0]}, "number them without gaps"),
-        ({"points": points, "instance": [0, 0]}, "instance of each of 3 points"),
-        ({"instance": [0, 0]}, "instance of each of 0 points"),
-        ({"points": points * np.nan, "instance": [0, 0, 0]}, "NaN"),
-    ):
-        np.savez(file, kind="Instances", **arrays)
-        with pytest.raises(PredictionError, match=fault):
-            recognise(file).read(file, "prediction")
+    np.savez(file, kind="Instances", points=points, instance=[2, -1, 0])
+    with pytest.raises(PredictionError, match="without gaps"):
+        recognise(file).read(file, "prediction")

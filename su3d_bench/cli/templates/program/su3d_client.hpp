@@ -95,11 +95,10 @@ class Parts {  // reads values from a request one after another
     copy(&value, sizeof value);
     return value;
   }
-  template <class Value> std::vector<Value> next(std::uint64_t n) {
+  template <class Value> void fill(std::vector<Value>& values, std::uint64_t n) {
     if (n > data_.size() / sizeof(Value)) throw std::runtime_error("a request is too short");
-    std::vector<Value> values(n);
+    values.resize(n);
     copy(values.data(), n * sizeof(Value));
-    return values;
   }
 
  private:
@@ -107,8 +106,22 @@ class Parts {  // reads values from a request one after another
   std::size_t place_ = 0;
 };
 
-inline std::string done(Mapper& mapper, std::uint32_t kind, const std::vector<char>& content) {
+// The text of the answer, after the call that a request stands for; the memory of frame is used again.
+inline std::string done(Mapper& mapper, std::uint32_t kind, const std::vector<char>& content, Frame& frame) {
   Parts parts(content);
+  if (kind == FRAME) {
+    frame.number = parts.next<std::int64_t>();
+    frame.time_s = parts.next<double>();
+    frame.width = parts.next<std::uint32_t>();
+    frame.height = parts.next<std::uint32_t>();
+    frame.intrinsics = parts.next<std::array<double, 9>>();
+    frame.camera_to_world = parts.next<Pose>();
+    const std::uint64_t n = std::uint64_t(frame.width) * frame.height;
+    parts.fill(frame.depth_m, n);
+    parts.fill(frame.rgb, 3 * n);
+    mapper.frame(frame);
+    return "";
+  }
   const std::string text(content.begin(), content.end());
   if (kind == HELLO) {
     Scene scene;
@@ -117,20 +130,6 @@ inline std::string done(Mapper& mapper, std::uint32_t kind, const std::vector<ch
       scene[line.substr(0, line.find(' '))] = line.substr(line.find(' ') + 1);
     mapper.start(scene);
     return "1";  // the version of the messages
-  }
-  if (kind == FRAME) {
-    Frame frame;
-    frame.number = parts.next<std::int64_t>();
-    frame.time_s = parts.next<double>();
-    frame.width = parts.next<std::uint32_t>();
-    frame.height = parts.next<std::uint32_t>();
-    frame.intrinsics = parts.next<std::array<double, 9>>();
-    frame.camera_to_world = parts.next<Pose>();
-    const std::uint64_t n = std::uint64_t(frame.width) * frame.height;
-    frame.depth_m = parts.next<float>(n);
-    frame.rgb = parts.next<std::uint8_t>(3 * n);
-    mapper.frame(frame);
-    return "";
   }
   if (kind == REVISE) {
     std::map<std::int64_t, Pose> poses;
@@ -161,14 +160,16 @@ inline int serve(Mapper& mapper) {
     return 2;
   }
   Header header{};
+  Frame frame;
+  std::vector<char> content;
   while (header.kind != FINISH) {
     try {
       read_exactly(requests, &header, sizeof header);
       if (std::memcmp(header.magic, "SU3D", 4) != 0 || header.n_bytes > MAX_REQUEST_BYTES)
         throw std::runtime_error("not a request of su3d-bench");
-      std::vector<char> content(header.n_bytes);
+      content.resize(header.n_bytes);
       read_exactly(requests, content.data(), content.size());
-      answer(answers, header.number, OK, done(mapper, header.kind, content));
+      answer(answers, header.number, OK, done(mapper, header.kind, content, frame));
     } catch (const Refused& refusal) {
       answer(answers, header.number, REFUSED, refusal.what());
     } catch (const std::exception& error) {
