@@ -58,8 +58,7 @@ class PipedProgram:
         """
         if self._fault:
             raise PredictionError(self._fault)
-        self._fault, start = f"{what}: was interrupted", time.perf_counter()
-        self._n_asked += 1
+        self._fault, self._n_asked, start = f"{what}: was interrupted", self._n_asked + 1, time.perf_counter()
         until = start + min(self._timeout_s, FINISH_S if kind == FINISH else self._timeout_s)
         parts = [memoryview(part).cast("B") for part in content]
         header = HEADER.pack(MAGIC, kind, self._n_asked, sum(map(len, parts)))
@@ -82,7 +81,7 @@ class PipedProgram:
         return text
 
     def end(self, *, in_order: bool = False) -> Finished:
-        """End the program; ``in_order``: it is told before that nothing follows, and may end by itself."""
+        """End the program; ``in_order``: after a last request, when it may end by itself."""
         if in_order and not self._fault:
             with suppress(PredictionError):
                 self.ask(FINISH, "finish")

@@ -170,7 +170,7 @@ def test_program_runs_live_in_real_time_and_midway_maps_are_its_snapshots(
 
 # A program without the client, which does one thing wrong with the third frame (or with another request).
 WRONG = """
-import os, struct, sys, time
+import os, signal, struct, sys
 how, pids = sys.argv[1:]
 open(pids, "a").write(f"{os.getpid()} ")
 requests = open(os.environ["SU3D_PIPES"] + "/requests", "rb")
@@ -187,7 +187,7 @@ while True:
     answer(100, number, b"1" if kind == 1 else b"")
     assert kind != 7
 """
-HANG = "time.sleep(60)"
+HANG = "signal.pause()"
 AT_2 = "rooms/a b: command: frame 2: "
 
 
