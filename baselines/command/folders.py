@@ -134,7 +134,7 @@ def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction
 
     files = [path for path in folder.iterdir() if not path.name.startswith(".")]
     if not files:
-        raise PredictionError("it ended without an error but wrote nothing to {output}")
+        raise PredictionError("it reports no error but wrote nothing to {output}")
     reader = recognise(folder, format)
     names = list(reader.scenes(folder))
     if not names:

@@ -1,96 +1,31 @@
-"""Any other program as a method: it is run once per scene, gets the frames in a folder, and writes a prediction.
-
-Dataset folders may have malicious names, such as ``x$(touch y)``. A value is never inserted into code: it is passed as
-an argument or in the environment; a shell line gets the variable instead.
-"""
+"""Any other program as a method: run once per scene, it gets all frames in a folder, or one by one while it runs."""
 
 from __future__ import annotations
 
 import logging
 import os
-import re
 import shlex
 import shutil
+import sys
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path, PurePath
-from typing import Annotated, Literal, Self
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.command.folders import ColourFormat, FrameFolder, as_prediction, class_names, read_output
+from su3d_bench.baselines.command.frame_by_frame import SceneProgram, saved_scene
+from su3d_bench.baselines.command.pipes import PipedProgram
+from su3d_bench.baselines.command.placeholders import PLACEHOLDER, PLACEHOLDERS, check_placeholders, variable_of
 from su3d_bench.baselines.command.process import Finished, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Prediction
-from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo, Surface
-
-PLACEHOLDER = re.compile(r"\{(\w*)\}")
-PLACEHOLDERS = ("frames", "output", "work", "scene", "dataset", "seed")
-BESIDE = re.compile(r"[\w./:=,@%+~\[\]-]*")  # characters allowed in one word with a placeholder: no code
-INTERPRETER = re.compile(
-    r"(ba|da|a|z|k|mk|fi|c|tc)?sh|busybox|su|runuser|script|flock|(python|pypy|perl|ruby|lua|php)[\d.]*|node|nodejs|deno"
-    r"|bun|R|Rscript|luajit|julia|octave"
-)
-WITH_A_VALUE = re.compile(r"-[OWX]|-[a-z]*o")  # interpreter options whose value may be a separate word
-CODE_OPTION = re.compile(r"-[A-Za-z]*[ceEpr]|--(eval|command|print|execute)=?")  # followed by a program
-
-
-def variable_of(name: str) -> str:
-    """The environment variable that holds the value of a placeholder.
-
-    >>> variable_of("scene")
-    'SU3D_SCENE'
-    """
-    return f"SU3D_{name.upper()}"
-
-
-def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
-    """Raises ``ValueError`` for an unknown placeholder, or one whose value would be read as code."""
-    if isinstance(command, str) and is_shell:
-        for name in _misplaced(command):
-            right = f'write {{{name}}} outside of quotes, or "${variable_of(name)}"'
-            raise ValueError(f"'{{{name}}}' is where a shell would read its value as commands; {right}")
-        return
-    words = shlex.split(command) if isinstance(command, str) else command
-    for k, word in enumerate(words):
-        names = [name for name in PLACEHOLDER.findall(word) if name]
-        if not names:
-            continue
-        if unknown := [name for name in names if name not in PLACEHOLDERS]:
-            raise ValueError(f"'{{{unknown[0]}}}' is an unknown placeholder; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
-        if not BESIDE.fullmatch(PLACEHOLDER.sub("", word)) or _is_code(words, k):
-            raise ValueError(
-                f"'{{{names[0]}}}' is inside text that may be read as code; make it a separate argument, or use "
-                f"the environment variable {variable_of(names[0])} there"
-            )
-
-
-def _misplaced(line: str) -> Iterator[str]:
-    """The placeholders of a shell line whose value would be read as commands, or fed to a shell."""
-    for found in PLACEHOLDER.finditer(line):
-        before = line[: found.start()]
-        unescaped = re.sub(r"\\.|(?:^|\s)#[^\n]*", "", before)
-        is_quoted = unescaped.count("'") % 2 or unescaped.count('"') % 2
-        if found[1] in PLACEHOLDERS and (is_quoted or "<<" in before or before.endswith(("$", "\\"))):
-            yield found[1]
-
-
-def _is_code(words: Sequence[str], k: int) -> bool:
-    """Whether an interpreter reads the ``k``-th word (preceded only by its options) as a program."""
-    for start in (n for n in range(k) if INTERPRETER.fullmatch(PurePath(words[n]).name)):
-        between = words[start + 1 : k]
-        are_options = all(
-            word.startswith(("-", "+")) or (n > 0 and WITH_A_VALUE.fullmatch(between[n - 1]))
-            for n, word in enumerate(between)
-        )
-        options = [*between, PLACEHOLDER.split(words[k])[0]]
-        if are_options and any(CODE_OPTION.fullmatch(option) for option in options):
-            return True
-    return False
-
+from su3d_bench.core.types import Detections, Float64Array, Frame, PerceptionNeeds, SceneInfo, Surface
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # the program's output goes to the log of its scene
@@ -99,7 +34,9 @@ Text = Annotated[str, Field(min_length=1)]
 Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # an option is not a name
 # The program's environment unless more is allowed: enough to start it, no credentials.
 ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_ALL", "TZ", "CUDA_VISIBLE_DEVICES", "LD_LIBRARY_PATH")
-INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # paths in a container
+PIPES = "pipes"  # a folder with the pipes of a program that gets one frame after another
+INSIDE = {name: f"/su3d/{name}" for name in ("frames", "output", "work", PIPES)}  # paths in a container
+READ_ONLY = ("frames", PIPES)  # in a container; pipes in such a folder can be written
 
 
 class CommandConfig(BaseModel):
@@ -111,6 +48,7 @@ class CommandConfig(BaseModel):
     - ``runner``: plain, docker (with ``image``, ``gpus`` as in docker, ``network``) or conda (with
       ``environment``, a name or a folder). ``mounts``: additional folders for the container, HERE:THERE, read-only
     - ``pass_variables``: environment variables passed to the program, if set
+    - ``frame_by_frame``: the program runs during the whole scene and answers messages; ``timeout_s`` is for one answer
     - ``format``: of the prediction, if it cannot be recognized; ``classes_of``: the protocol whose class numbers the
       program writes, if the dataset has several lists
     """
@@ -125,6 +63,7 @@ class CommandConfig(BaseModel):
     network: bool = False
     environment: Name = ""
     mounts: tuple[Annotated[str, Field(pattern=r"^/[^:]*:/[^:]*$")], ...] = ()
+    frame_by_frame: bool = False
     pass_variables: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = ENVIRONMENT
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3600.0
     format: str | None = None
@@ -160,7 +99,7 @@ class CommandConfig(BaseModel):
 
 
 class Command:
-    """Runs your program once per scene: frames in a folder, a prediction in any format that evaluate reads."""
+    """Runs your program once per scene: frames in a folder or one by one, maps in any format that evaluate reads."""
 
     name = "command"
     is_system = False
@@ -182,7 +121,9 @@ class Command:
         self._frames: FrameFolder | None = None
         self._surface: Surface | None = None
         self._scratch: TemporaryFolder | None = None
-        # Costs of the program's last run: ``program_s`` and, if measured, ``program_peak_bytes``.
+        self._live: SceneProgram | None = None  # the running program of ``frame_by_frame``
+        self.as_of: int | None = None
+        # Costs of the program until its last map: ``program_s`` and, if measured, ``program_peak_bytes``.
         self.finish_costs: dict[str, float | int] = {}
 
     @property
@@ -213,48 +154,126 @@ class Command:
         self._scratch = TemporaryFolder("su3d-command-")
         self._frames = FrameFolder(self._scratch.path / "frames", scene, self.config.colour, self._surface)
         self._frames.open()
+        if self.config.frame_by_frame:
+            self._start_program()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Adds the frame to the folder; the program runs when the map is requested."""
+        """Gives the frame to the running program, or adds it to the folder that the program gets with ``finish``."""
         assert self._frames is not None, "update before start"
+        if self._live is not None:
+            with timer.stage("program"), self._errors():
+                self._live.send(frame)
+            return
         with timer.stage("export"):
             self._frames.add(frame)
 
     def finish(self) -> Prediction:
         """The program's map of the frames so far."""
-        assert self._frames is not None and self._scratch is not None and self._scene is not None, "finish before start"
-        self._frames.close()
-        where = f"{self._scene.dataset}/{self._scene.scene}: command"
-        folders = {name: self._scratch.path / name for name in INSIDE}
-        for name in ("output", "work"):
-            shutil.rmtree(folders[name], ignore_errors=True)
-            folders[name].mkdir()
-        try:
-            self._run(folders)
-            prediction = read_output(folders["output"], self._scene.scene, self.config.format)
+        assert self._frames is not None and self._scene is not None, "finish before start"
+        if self._live is None:
+            self._frames.close()
+        with self._errors():
+            if self._live is None:
+                output = self._run()
+            else:
+                output, self.as_of = self._live.current_map()
+                watch = self._live.piped.program.watch
+                watch.look()
+                self._set_costs(self._live.piped.waited_s, watch.peak_bytes)
+            prediction = read_output(output, self._scene.scene, self.config.format)
             for remark in prediction.remarks:
                 logger.warning("%s", printable(remark))
             names = class_names(prediction.content, self._scene.dataset, self.config.classes_of)
             return as_prediction(prediction.content, self._surface, names)
-        except Su3dError as error:
-            text = str(error).replace(str(folders["output"]), "{output}")
-            raise PredictionError(f"{where}: {text}") from error
+
+    def revise(self, poses: Mapping[int, Float64Array]) -> None:
+        """Moves frames, if the program can; ``ConfigError`` if it refuses."""
+        with self._errors():
+            self._running("be revised").revise(poses)
+
+    def save_state(self, folder: Path) -> None:
+        """Stores the program's state; ``ConfigError`` if it refuses."""
+        with self._errors():
+            self._running("be saved").save(folder, self._surface)
+
+    def load_state(self, folder: Path) -> None:
+        """Starts the program with a saved state."""
+        scene, numbers = saved_scene(folder)
+        self.start(scene)
+        with self._errors():
+            self._running("be loaded").load(folder, numbers)
 
     def close(self) -> None:
-        """Remove the program's folders."""
-        if self._scratch is not None:
-            self._scratch.close()
-        self._scratch = self._frames = None
+        """End a running program and remove its folders."""
+        live, self._live = self._live, None
+        try:
+            if live is not None:
+                self._log(live.piped.end(in_order=sys.exc_info()[0] is None))  # not if the run fails or is interrupted
+        finally:
+            if self._scratch is not None:
+                self._scratch.close()
+            self._scratch = self._frames = None
 
     def __del__(self) -> None:
         if getattr(self, "_scratch", None) is not None:
             self.close()
 
-    def _run(self, folders: Mapping[str, Path]) -> None:
+    def _running(self, what: str) -> SceneProgram:
+        if self._live is None:
+            raise ConfigError(f"method 'command': cannot {what} unless frame_by_frame = true")
+        return self._live
+
+    @property
+    def _folders(self) -> dict[str, Path]:
+        assert self._scratch is not None
+        names = [name for name in INSIDE if name != PIPES or self.config.frame_by_frame]
+        return {name: self._scratch.path / name for name in names}
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Errors in the block name the scene."""
+        assert self._scene is not None
+        output = str(self._folders["output"])
+        try:
+            yield
+        except Su3dError as error:
+            text = str(error).replace(output, "{output}")
+            kind = ConfigError if isinstance(error, ConfigError) else PredictionError
+            raise kind(f"{self._scene.dataset}/{self._scene.scene}: command: {text}") from error
+
+    def _start_program(self) -> None:
+        assert self._scene is not None
+        for folder in self._folders.values():
+            folder.mkdir(exist_ok=True)
+        with self._errors():
+            words, places, how = self._command()
+            program = PipedProgram(self._folders[PIPES], self.config.timeout_s, words, **how)
+            self._live = SceneProgram(program, self._scene, self._folders, places)
+            self._live.greet()
+
+    def _run(self) -> Path:
+        """The folder with the program's output."""
+        folders = self._folders
+        for name in ("output", "work"):
+            shutil.rmtree(folders[name], ignore_errors=True)
+            folders[name].mkdir()
+        words, _, how = self._command()
+        done = run_program(words, timeout_s=self.config.timeout_s, **how)
+        self._set_costs(done.wall_s, done.peak_memory_bytes)
+        self._log(done)
+        if done.is_timed_out:
+            raise PredictionError(f"terminated after {self.config.timeout_s:g} s (timeout_s){done.last_line}")
+        if done.exit_code != 0:
+            raise PredictionError(f"{done.ending}{done.last_line}")
+        return folders["output"]
+
+    def _command(self) -> tuple[list[str], dict[str, str], dict[str, Any]]:
+        """The words of the program, its folders as it sees them, and the arguments of ``Program``."""
+        folders = self._folders
         container = f"su3d-{uuid.uuid4().hex[:16]}" if self.config.runner == "docker" else None
         places = {name: INSIDE[name] if container else str(path) for name, path in folders.items()}
         words = self._filled(places)
-        variables = {variable_of(name): value for name, value in self._values(places).items()}
+        variables = {variable_of(name): value for name, value in (self._values(places) | places).items()}
         id_file = folders["frames"].parent / "container"
         id_file.unlink(missing_ok=True)
         if container is not None:
@@ -264,24 +283,15 @@ class Command:
             words = ["conda", "run", "--no-capture-output", kind, self.config.environment, *words]
         environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ} | variables
         logger.info("program: %s", printable(shlex.join(words)))
-
-        done = run_program(
-            words,
-            folder=folders["work"],
-            environment=environment,
-            timeout_s=self.config.timeout_s,
-            id_file=None if container is None else id_file,
+        how = {
+            "folder": folders["work"],
+            "environment": environment,
+            "id_file": None if container is None else id_file,
             # `docker run` may end before its container does: ending the client is not enough.
-            afterwards=() if container is None else ("docker", "kill", container),
-            scratch=folders["frames"].parent,
-        )
-        self._record(done)
-        last = _last_line(done.stderr)
-        if done.is_timed_out:
-            raise PredictionError(f"terminated after {self.config.timeout_s:g} s (timeout_s){last}")
-        if done.exit_code != 0:
-            how = f"exit code {done.exit_code}" if done.exit_code > 0 else f"terminated by signal {-done.exit_code}"
-            raise PredictionError(f"{how}{last}")
+            "afterwards": () if container is None else ("docker", "kill", container),
+            "scratch": folders["frames"].parent,
+        }
+        return words, places, how
 
     def _values(self, folders: Mapping[str, str]) -> dict[str, str]:
         assert self._scene is not None
@@ -301,7 +311,7 @@ class Command:
     def _docker_words(
         self, container: str, id_file: Path, folders: Mapping[str, Path], variables: Mapping[str, str]
     ) -> list[str]:
-        mounts = [f"{folders[name]}:{INSIDE[name]}{':ro' if name == 'frames' else ''}" for name in INSIDE]
+        mounts = [f"{path}:{INSIDE[name]}{':ro' if name in READ_ONLY else ''}" for name, path in folders.items()]
         mounts += [f"{mount}:ro" for mount in self.config.mounts]
         words = ["docker", "run", "--rm", "--init", "--name", container, "--cidfile", str(id_file)]
         words += ["--user", f"{os.getuid()}:{os.getgid()}", "--workdir", INSIDE["work"]]
@@ -315,13 +325,15 @@ class Command:
             words += ["--env", name]
         return [*words, self.config.image]
 
-    def _record(self, done: Finished) -> None:
-        self.finish_costs = {"program_s": round(done.wall_s, 3)}
-        memory = f"peak memory {done.memory_source}"
-        if done.peak_memory_bytes is not None:
-            self.finish_costs["program_peak_bytes"] = done.peak_memory_bytes
-            memory = f"peak memory {done.peak_memory_bytes / 2**20:.0f} MiB ({done.memory_source})"
-        logger.info("the program took %.1f s, %s", done.wall_s, memory)
+    def _set_costs(self, program_s: float, peak_bytes: int | None) -> None:
+        peak = {} if peak_bytes is None else {"program_peak_bytes": peak_bytes}
+        self.finish_costs = {"program_s": round(program_s, 3), **peak}
+
+    def _log(self, done: Finished) -> None:
+        n_bytes = done.peak_memory_bytes
+        memory = "" if n_bytes is None else f"{n_bytes / 2**20:.0f} MiB "
+        took = f"{done.wall_s:.1f} s, {done.ending}, peak memory {memory}({done.memory_source})"
+        logger.info("the program took %s", took)
         for name, text in (("stdout", done.stdout), ("stderr", done.stderr)):
             for line in text.splitlines():
                 logger.info("%s: %s", name, printable(line, 2000))
@@ -336,8 +348,3 @@ def _program_file(word: str) -> Path | None:
         program = shutil.which(word)
         path = Path(program) if program else path
     return path if is_file(path) else None
-
-
-def _last_line(stderr: str) -> str:
-    lines = [line for line in map(printable, stderr.splitlines()) if line]
-    return f"; its last line: {lines[-1][:200]}" if lines else "; it wrote nothing to stderr"

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 from su3d_bench.baselines.command import supervisor
 from su3d_bench.baselines.command.supervisor import DONE, KILL_WAIT_S, STOP
-from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.system.files import file_text
 
 SUPERVISOR = Path(supervisor.__file__)
@@ -50,6 +50,17 @@ class Finished:
     memory_source: str
     stdout: str
     stderr: str
+
+    @property
+    def ending(self) -> str:
+        """How it ended, as a clause."""
+        return f"exit code {self.exit_code}" if self.exit_code >= 0 else f"terminated by signal {-self.exit_code}"
+
+    @property
+    def last_line(self) -> str:
+        """The end of a message: the last line of stderr."""
+        lines = [line for line in map(printable, self.stderr.splitlines()) if line]
+        return f"; its last line: {lines[-1][:200]}" if lines else "; it wrote nothing to stderr"
 
 
 class MemoryMonitor:
@@ -222,49 +233,67 @@ class _Supervised:
         return answer
 
 
-def run_program(
-    words: Sequence[str],
-    *,
-    folder: Path,
-    environment: Mapping[str, str],
-    timeout_s: float,
-    id_file: Path | None = None,
-    afterwards: Sequence[str] = (),
-    scratch: Path | None = None,
-) -> Finished:
-    """Run ``words`` in ``folder`` until it ends or after ``timeout_s``; nothing it started outlives the call.
+class Program:
+    """A running program, its output and its memory; nothing that it started outlives ``end``.
 
     This also holds if this process dies: ``afterwards`` is run if the program does not end by itself, and ``scratch``
-    is removed if this process is gone. Docker writes the container id into ``id_file``. A
-    program that cannot be started is a ``ConfigError``.
+    is removed if this process is gone. Docker writes the container id into ``id_file``. A program that cannot be
+    started is a ``ConfigError``.
     """
-    start = time.perf_counter()
-    with closing(_Supervised(words, folder, environment, afterwards, scratch)) as program:
-        tails = [_Tail(stream) for stream in program.streams]
-        for tail in tails:
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        *,
+        folder: Path,
+        environment: Mapping[str, str],
+        id_file: Path | None = None,
+        afterwards: Sequence[str] = (),
+        scratch: Path | None = None,
+    ) -> None:
+        self._start = time.perf_counter()
+        self._supervised = _Supervised(words, folder, environment, afterwards, scratch)
+        self.watch = MemoryMonitor(self._supervised.pid, id_file)
+        self._tails = [_Tail(stream) for stream in self._supervised.streams]
+        for tail in self._tails:
             tail.start()
-        watch = MemoryMonitor(program.pid, id_file)
-        is_timed_out = False
-        try:
-            is_timed_out = not _ends_within(program, watch, start, timeout_s)
-            wall_s = time.perf_counter() - start
-            if is_timed_out:
-                program.stop()
-                _ends_within(program, watch, time.perf_counter(), GRACE_S)
-        finally:
-            program.end()
-            watch.end()
-        stdout, stderr = (tail.text() for tail in tails)
-    exit_code = -signal.SIGKILL if program.exit_code is None else program.exit_code
-    return Finished(exit_code, is_timed_out, wall_s, watch.peak_bytes, watch.source, stdout, stderr)
+
+    def has_ended(self, wait_s: float) -> bool:
+        """Whether the program has ended, waiting at most ``wait_s``."""
+        return self._supervised.has_ended(wait_s)
+
+    def ends_within(self, limit_s: float) -> bool:
+        """Whether the program ends by itself in the next ``limit_s``."""
+        start, wait_s = time.perf_counter(), 0.0
+        while not self.has_ended(wait_s):
+            self.watch.look()
+            elapsed_s = time.perf_counter() - start
+            if elapsed_s >= limit_s:
+                return False
+            wait_s = min(0.01 + elapsed_s / 20, MAX_WAIT_S, limit_s - elapsed_s)
+        return True
+
+    def end(self, *, is_timed_out: bool = False) -> Finished:
+        """End the program and everything that it started; one that is ``is_timed_out`` is asked to stop first."""
+        wall_s = time.perf_counter() - self._start
+        with closing(self._supervised) as program:
+            try:
+                if is_timed_out:
+                    program.stop()
+                    self.ends_within(GRACE_S)
+            finally:
+                program.end()
+                self.watch.end()
+            stdout, stderr = (tail.text() for tail in self._tails)
+        exit_code = -signal.SIGKILL if program.exit_code is None else program.exit_code
+        return Finished(exit_code, is_timed_out, wall_s, self.watch.peak_bytes, self.watch.source, stdout, stderr)
 
 
-def _ends_within(program: _Supervised, watch: MemoryMonitor, start: float, limit_s: float) -> bool:
-    wait_s = 0.0
-    while not program.has_ended(wait_s):
-        watch.look()
-        elapsed_s = time.perf_counter() - start
-        if elapsed_s >= limit_s:
-            return False
-        wait_s = min(0.01 + elapsed_s / 20, MAX_WAIT_S, limit_s - elapsed_s)
-    return True
+def run_program(words: Sequence[str], *, timeout_s: float, **how: Any) -> Finished:
+    """Run ``words`` as a ``Program`` until it ends or after ``timeout_s``; ``how``: its arguments."""
+    program, is_timed_out = Program(words, **how), False
+    try:
+        is_timed_out = not program.ends_within(timeout_s)
+    finally:
+        finished = program.end(is_timed_out=is_timed_out)
+    return finished

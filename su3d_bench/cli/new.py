@@ -22,6 +22,8 @@ REGISTRY_FILES = {
     "workflow.yml": ".github/workflows/registry.yml",
 }
 KEPT = "bundles/.gitkeep"
+# Clients and examples of programs that get a scene frame by frame.
+PROGRAM_FILES = ("su3d_client.py.txt", "su3d_client.hpp", "voxels.py.txt", "voxels.cpp")
 # Next commands; {at} is the file on the command line.
 NEXT = {
     "method": ("methods check {at}", "run --scenes homes/tuning0 --methods {at}"),
@@ -45,7 +47,8 @@ def add_new(verbs: Verbs, what: str) -> None:
     if what == REGISTRY:
         parser.option("file DIR", "folder to create", type=output_path)
     else:
-        parser.option("file FILE", f"file to create; its name becomes that of the {what}", type=output_path)
+        programs = "; a folder gets clients and examples in Python and C++ instead" if what == "method" else ""
+        parser.option("file FILE", f"file to create; its name becomes that of the {what}{programs}", type=output_path)
 
 
 def call(arguments: argparse.Namespace) -> None:
@@ -55,6 +58,9 @@ def call(arguments: argparse.Namespace) -> None:
     what, file = arguments.what, arguments.file
     if what == REGISTRY:
         _new_registry(file, arguments)
+        return
+    if what == "method" and not file.suffix:
+        _new_program(file, arguments)
         return
     if file.suffix != SUFFIX[what]:
         raise ConfigError(f"{what}s new: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
@@ -71,6 +77,21 @@ def call(arguments: argparse.Namespace) -> None:
     commands = [f"su3d-bench {command.format(at=at)}" for command in NEXT[what]]
     lines = (f"{file}; then:", *(f"  {command}" for command in commands))
     answer_either(arguments, {"file": str(file), "next": commands}, *lines)
+
+
+def _new_program(folder: Path, arguments: argparse.Namespace) -> None:
+    """Write programs that get a scene frame by frame, in Python and C++, and the clients that they use."""
+    from su3d_bench.cli.output import written
+    from su3d_bench.core.system.files import file_text
+
+    if folder.exists():
+        raise ConfigError(f"methods new: {folder} exists; choose another folder")
+    for name in PROGRAM_FILES:
+        written(folder / name.removesuffix(".txt"), file_text(TEMPLATES / "program" / name))
+    words = f"""command.frame_by_frame=true 'command.command=["python", "{folder}/voxels.py"]'"""
+    command = f"su3d-bench run --scenes homes/tuning0 --methods command --set {words}"
+    lines = (f"{folder}: clients and examples in Python and C++; then:", f"  {command}")
+    answer_either(arguments, {"file": str(folder), "next": [command]}, *lines)
 
 
 def _new_registry(folder: Path, arguments: argparse.Namespace) -> None:

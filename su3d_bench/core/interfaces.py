@@ -277,8 +277,9 @@ class MethodFacts(MethodAbility, Protocol):
 
 class MethodFigures(MethodAbility, Protocol):
     """Optional properties of a method object: points, instances and bytes of its map after an update; what the last
-    update discarded, by column of ``updates.csv``; numbers on the last ``finish``, reported with its time; digests by
-    name of files outside the configuration that change its numbers; and a caveat to report with these."""
+    update discarded, by column of ``updates.csv``; numbers on the last ``finish``, reported with its time, and the last
+    frame in its map, if that may be behind the updates; digests by name of files outside the configuration that change
+    its numbers; and a caveat to report with these."""
 
     @property
     def n_points(self) -> int: ...
@@ -294,6 +295,9 @@ class MethodFigures(MethodAbility, Protocol):
 
     @property
     def finish_costs(self) -> Mapping[str, float | int]: ...
+
+    @property
+    def as_of(self) -> int | None: ...
 
     @property
     def inputs(self) -> Mapping[str, str]: ...

@@ -17,7 +17,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.online.saved import SessionRecord, load_state, write_session
-from su3d_bench.online.snapshots import AsOf, PendingSnapshot, Snapshot
+from su3d_bench.online.snapshots import AsOf, PendingSnapshot, Snapshot, as_of_map
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.questions.model import RankedInstance, best_of, rank
 from su3d_bench.runs.frame_loop import detections_of
@@ -50,10 +50,14 @@ class Session:
         self._pending: list[PendingSnapshot] = []
         self._fault = ""
         self.n_updates, self.as_of = record.n_updates, AsOf(*record.as_of)
-        if saved is None:
-            method.start(scene)
-        else:
-            load_state(saved, _able_to_save(method), record)
+        try:
+            if saved is None:
+                method.start(scene)
+            else:
+                load_state(saved, _able_to_save(method), record)
+        except BaseException:
+            self.close()
+            raise
 
     @typed
     def push(self, frame: Frame, detections: Detections | None = None) -> None:
@@ -100,7 +104,7 @@ class Session:
             self._pending.append(PendingSnapshot(self._method, self.as_of))
             return self._pending[-1]
         if self._latest is None:
-            self._latest = Snapshot(self._method.finish(), self.as_of)
+            self._latest = Snapshot(self._method.finish(), as_of_map(self._method, self.as_of))
         return self._latest
 
     @typed

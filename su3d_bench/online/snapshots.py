@@ -8,7 +8,7 @@ import signal
 import sys
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from su3d_bench.core.errors import StoreError, error_line
@@ -38,6 +38,12 @@ class Snapshot:
     as_of: AsOf
 
 
+def as_of_map(method: Method, pushed: AsOf) -> AsOf:
+    """The frames in the last map of ``method`` after these were pushed: a method may state that it is behind."""
+    last = getattr(method, "as_of", None)
+    return pushed if last is None else replace(pushed, geometry=last)
+
+
 class PendingSnapshot:
     """A map as it is now, computed while updates go on; get it with ``result`` before the session is closed.
 
@@ -60,6 +66,7 @@ class PendingSnapshot:
         if self.reason_for_blocking is not None:
             logger.info("snapshot: computed at once: %s", self.reason_for_blocking)
             write_prediction(self._map, method.finish())  # the map itself may have views of what updates change
+            self.as_of = as_of_map(method, as_of)
             return
         with warnings.catch_warnings():  # Python 3.12 warns if there are other threads; ``finish`` needs none of them
             warnings.simplefilter("ignore", DeprecationWarning)

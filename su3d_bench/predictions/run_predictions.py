@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files.atomic import write_npz
-from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.formats.arrays import array_of
 from su3d_bench.formats.numpy_files import map_npy, npz_names, read_npz
 from su3d_bench.predictions.base import Content, Numbering, Parsed, Reader, VertexLabels, VertexMasks, named
 from su3d_bench.store.predictions import (
     OVER_VERTICES,
+    array_fault,
     features_beside,
     prediction_from_arrays,
     read_prediction,
@@ -53,10 +54,20 @@ def stored_prediction(place: Path, scene: str) -> Parsed:
             raise PredictionError(f"{shown(file)}: stores its table column by column; copy it again")
         arrays["features"] = table
     with named(where):
-        content = prediction_from_arrays(arrays, where)
+        is_short = str(arrays.get("kind")) == Instances.__name__ and "instance" in arrays
+        content = _of_owners(arrays) if is_short else prediction_from_arrays(arrays, where)
         if fault := value_fault(content):
             raise PredictionError(f"{fault}; run the scene again")
     return content, ()
+
+
+def _of_owners(arrays: Mapping[str, NDArray[Any]]) -> Instances:
+    """The map of a file of other programs: for each point the number of its instance, from 0 and -1 for none."""
+    if fault := array_fault(arrays):
+        raise PredictionError(fault)
+    points, labels = arrays.get("points", np.zeros((0, 3))).astype(np.float32), arrays.get("labels")
+    names = None if labels is None else labels.tolist()
+    return Instances.of(points, arrays["instance"], arrays.get("scores"), arrays.get("features"), labels=names)
 
 
 def write_content(path: Path, content: Content) -> None:

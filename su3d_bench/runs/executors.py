@@ -213,9 +213,9 @@ def limit_memory(n_bytes: int | None) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-# How libraries report that memory cannot be allocated: C++, OpenCV, ONNX Runtime, torch, threads of Python.
-_OUT_OF_MEMORY = ("bad_alloc", "Insufficient memory", "Failed to allocate memory", "can't allocate memory",
-                  "can't start new thread")  # fmt: skip
+# How programs and libraries report that memory cannot be allocated: C++, Python, OpenCV, ONNX Runtime, torch, threads.
+_OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Insufficient memory", "Failed to allocate memory",
+                  "can't allocate memory", "can't start new thread")  # fmt: skip
 
 
 def exceeds_memory(error: BaseException, memory: str) -> str | None:

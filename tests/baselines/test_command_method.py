@@ -17,7 +17,8 @@ from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.baselines.command.folders import FrameFolder, class_names
-from su3d_bench.baselines.command.method import Command, CommandConfig, check_placeholders
+from su3d_bench.baselines.command.method import Command, CommandConfig
+from su3d_bench.baselines.command.placeholders import check_placeholders
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
@@ -149,7 +150,7 @@ def test_ambiguous_class_numbers_need_a_protocol() -> None:
             "rooms/a b: command: exit code 3; its last line: \\x1b[31mno weights\\x07",
         ),
         ("import os; os.kill(os.getpid(), 9)", {}, "terminated by signal 9; it wrote nothing to stderr"),
-        ("", {}, "it ended without an error but wrote nothing to {output}"),
+        ("", {}, "it reports no error but wrote nothing to {output}"),
         ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: is in no known format"),
         ("import sys; open(sys.argv[1] + '/p.npz', 'wb').write(b'?')", {"format": "openmask3d"}, "{output}"),
     ],
@@ -218,7 +219,7 @@ SHOWN = "import sys; open(sys.argv[1] + '/../shown', 'w').write(repr(sys.argv[2:
 def test_shell_gets_the_scene_name_only_as_a_value(tmp_path: Path, line: str) -> None:
     line = line.replace("RUN", f"'{sys.executable}' '{program(tmp_path, SHOWN)}'")
     one = fed(Command(CommandConfig(command=line, shell=True)), scene=replace(SCENE, scene=HOSTILE))
-    with pytest.raises(PredictionError, match="it ended without an error but wrote nothing"):
+    with pytest.raises(PredictionError, match="it reports no error but wrote nothing"):
         one.finish()
     assert one._scratch is not None
     assert (one._scratch.path / "shown").read_text() == repr([HOSTILE])

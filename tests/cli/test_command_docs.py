@@ -17,7 +17,7 @@ from command_pages import COMMON_OPTIONS, MORE, command_pages, place_of_command
 from fuzz_words import verbs
 from places import ROOT
 
-from su3d_bench.baselines.command.method import PLACEHOLDERS, variable_of
+from su3d_bench.baselines.command.placeholders import PLACEHOLDERS, variable_of
 from su3d_bench.cli.main import build_parser
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.metrics.instance.average_precision import ap_columns
