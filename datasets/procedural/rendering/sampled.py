@@ -59,7 +59,7 @@ class SampledRenderer(Renderer):
         colour = self._shaded(hits, is_edge, step.astype(np.float32))
         samples = self._border_samples(camera_to_world, is_edge)
         rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
-        self._in_threads(encode, n, self.width, colour, is_edge, *samples, np.float32(gain), self._codes, t, triangle,
+        self._in_threads(encode, self.height, self.width, colour, is_edge, *samples, np.float32(gain), self._codes, t, triangle,
                          mesh.instance_of_triangle, rgb, depth, instance)  # fmt: skip
         shape = (self.height, self.width)
         return RenderedFrame(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape))
@@ -90,9 +90,9 @@ class SampledRenderer(Renderer):
                          mesh.material_of_triangle, self._rows, mesh.lights, colour, tint, onward)  # fmt: skip
         going_on = np.flatnonzero(tint[:, 0])
         if len(going_on):
-            rays = onward[going_on]
+            rays = onward.take(going_on, axis=0)
             beyond = self._shaded(self._hits(rays), np.zeros(len(rays), np.bool_), np.zeros_like(step), level + 1)
-            colour[going_on] += tint[going_on] * beyond
+            colour[going_on] += tint.take(going_on, axis=0) * beyond
         return colour
 
     def _hits(self, rays: Float32Array) -> tuple[Any, ...]:

@@ -29,26 +29,27 @@ SMOOTH_COSINE = 0.92  # between the facets of a curved surface
 @compiled
 def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, material, is_edge):  # type: ignore[no-untyped-def]
     """Marks the pixels of rows ``start`` to ``stop`` with a neighbour on another object, material or plane."""
-    for i in range(start * width, stop * width):
-        column, hit = i % width, t[i] < 1e9
-        f = triangle[i] if hit else 0
-        nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
-        height = t[i] * (nx * rays[i, 3] + ny * rays[i, 4] + nz * rays[i, 5])
-        is_edge[i] = False
-        for k in range(4):
-            j = i + (k == 0) - (k == 1) + width * ((k == 2) - (k == 3))
-            if (k == 0 and column == width - 1) or (k == 1 and column == 0) or not 0 <= j < t.shape[0]:
-                continue
-            g = triangle[j]
-            if f == g or not (hit or t[j] < 1e9):
-                continue
-            if hit and t[j] < 1e9 and instance[f] == instance[g] and material[f] == material[g]:
-                alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
-                off = t[j] * (nx * rays[j, 3] + ny * rays[j, 4] + nz * rays[j, 5]) - height
-                if alike > SMOOTH_COSINE and abs(off) < 0.002 * t[i] + 0.001:
+    for row in range(start, stop):
+        for column in range(width):
+            i = row * width + column
+            hit, is_edge[i] = t[i] < 1e9, False
+            f = triangle[i] if hit else 0
+            for k in range(4):
+                j = i + (k == 0) - (k == 1) + width * ((k == 2) - (k == 3))
+                if (k == 0 and column == width - 1) or (k == 1 and column == 0) or not 0 <= j < t.shape[0]:
                     continue
-            is_edge[i] = True
-            break
+                g = triangle[j]
+                if f == g or not (hit or t[j] < 1e9):
+                    continue
+                if hit and t[j] < 1e9 and instance[f] == instance[g] and material[f] == material[g]:
+                    nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+                    alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
+                    off = t[j] * (nx * rays[j, 3] + ny * rays[j, 4] + nz * rays[j, 5])
+                    off -= t[i] * (nx * rays[i, 3] + ny * rays[i, 4] + nz * rays[i, 5])
+                    if alike > SMOOTH_COSINE and abs(off) < 0.002 * t[i] + 0.001:
+                        continue
+                is_edge[i] = True
+                break
 
 
 @compiled
@@ -63,7 +64,7 @@ def aim_at_borders(is_edge, focal_inverse, pose, number, rays):  # type: ignore[
     In the order of pixels, so that neighbours follow each other.
     """
     _, height, width = number.shape
-    n, direction = 0, np.empty((1, 3))
+    n, m = 0, focal_inverse
     for row in range(height):
         for column in range(width):
             i = row * (width - 1) + column
@@ -75,9 +76,9 @@ def aim_at_borders(is_edge, focal_inverse, pose, number, rays):  # type: ignore[
                     k == 1 and row > 0 and inside[1] and is_edge[i - width + 1]
                 ):
                     u, v = (column - 0.5, row + shift) if k == 0 else (column - shift, row - 0.5)
+                    x, y = u * m[0, 0] + v * m[0, 1] + m[0, 2], u * m[1, 0] + v * m[1, 1] + m[1, 2]
                     for c in range(3):
-                        direction[0, c] = u * focal_inverse[c, 0] + v * focal_inverse[c, 1] + focal_inverse[c, 2]
-                    aim(direction, pose, rays[n : n + 1])
+                        rays[n, c], rays[n, 3 + c] = pose[c, 3], pose[c, 0] * x + pose[c, 1] * y + pose[c, 2]
                     number[k, row, column] = n
                     n += 1
     return n
@@ -218,15 +219,19 @@ CODES = 4096  # entries of the table of encoded values, by the square root of li
 
 @compiled
 def encode(start, stop, width, colour, is_edge, number, samples, gain, codes, t, triangle, instance, rgb, depth, ids):  # type: ignore[no-untyped-def]
-    """Fills ``rgb``, ``depth`` and ``ids`` of pixels ``start`` to ``stop``; an edge has the mean of its four samples."""
-    for i in range(start, stop):
-        row, column, hit = i // width, i % width, t[i] < 1e9
-        depth[i], ids[i] = t[i] if hit else 0.0, instance[triangle[i]] if hit else 0
-        left, right = number[0, row, column], number[0, row, column + 1]
-        top, bottom = number[1, row, column], number[1, row + 1, column]
-        for k in range(3):
-            value = colour[i, k]
+    """Fills ``rgb``, ``depth`` and ``ids`` of rows ``start`` to ``stop``; an edge has the mean of its four samples."""
+    for row in range(start, stop):
+        for column in range(width):
+            i = row * width + column
+            hit = t[i] < 1e9
+            depth[i], ids[i] = t[i] if hit else 0.0, instance[triangle[i]] if hit else 0
+            left = right = top = bottom = 0
             if is_edge[i]:
-                value = samples[left, k] + samples[right, k] + samples[top, k] + samples[bottom, k]
-                value /= np.float32(4)
-            rgb[i, k] = codes[min(CODES - 1, int(math.sqrt(max(value * gain, 0.0)) * (CODES / 4)))]
+                left, right = number[0, row, column], number[0, row, column + 1]
+                top, bottom = number[1, row, column], number[1, row + 1, column]
+            for k in range(3):
+                value = colour[i, k]
+                if is_edge[i]:
+                    value = samples[left, k] + samples[right, k] + samples[top, k] + samples[bottom, k]
+                    value /= np.float32(4)
+                rgb[i, k] = codes[min(CODES - 1, int(math.sqrt(max(value * gain, 0.0)) * (CODES / 4)))]
