@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ import numpy as np
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.rendering.render import FOCAL_PER_WIDTH, RenderedFrame, Renderer
-from su3d_bench.numerics.open3d_core import compiled_open3d
 
 MAX_CONTINUATIONS = 4  # of a ray, through the two sides of two panes, or a mirror in them
 MIN_PARALLEL, PIECES = 400, 8  # rays or rows for which threads pay; pieces per thread, whose costs differ
@@ -47,20 +47,19 @@ class SampledRenderer(Renderer):
 
     def render(self, camera_to_world: Float64Array, gain: float = 1.0) -> RenderedFrame:
         """``gain`` multiplies linear light before it is encoded, as exposure does."""
-        from su3d_bench.datasets.procedural.rendering.sampled_kernels import aim_part, encode, mark_edges
+        from su3d_bench.datasets.procedural.rendering.sampled_kernels import encode, mark_edges
 
         mesh, n = self._mesh, self.width * self.height
-        rays, is_edge = np.empty((n, 6), np.float32), np.empty(n, np.bool_)
-        self._in_threads(aim_part, n, self._directions, camera_to_world, rays)
-        hits = rays, t, triangle, _ = self._hits(rays)
+        hits = rays, t, triangle, _ = self._cast(camera_to_world, self._directions)
+        is_edge = np.empty(n, np.bool_)
         self._in_threads(mark_edges, self.height, self.width, t, triangle, rays, self._face_normals,
                          mesh.instance_of_triangle, mesh.material_of_triangle, is_edge)  # fmt: skip
         step = camera_to_world[:3, :2].T / (FOCAL_PER_WIDTH * self.width)
         colour = self._shaded(hits, is_edge, step.astype(np.float32))
         samples = self._border_samples(camera_to_world, is_edge)
         rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
-        self._in_threads(encode, self.height, self.width, colour, is_edge, *samples, np.float32(gain), self._codes, t, triangle,
-                         mesh.instance_of_triangle, rgb, depth, instance)  # fmt: skip
+        self._in_threads(encode, self.height, self.width, colour, is_edge, *samples, np.float32(gain), self._codes,
+                         t, triangle, mesh.instance_of_triangle, rgb, depth, instance)  # fmt: skip
         shape = (self.height, self.width)
         return RenderedFrame(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape))
 
@@ -95,16 +94,20 @@ class SampledRenderer(Renderer):
             colour[going_on] += tint.take(going_on, axis=0) * beyond
         return colour
 
-    def _hits(self, rays: Float32Array) -> tuple[Any, ...]:
-        """``rays`` (N, 6), and for each the distance, triangle and barycentric coordinates of what it hits."""
-        answer = self._scene.cast_rays(compiled_open3d().core.Tensor.from_numpy(rays))
-        return rays, *(answer[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs"))
-
     def _in_threads(self, kernel: Callable[..., None], n: int, *values: Any) -> None:
         """``kernel(start, stop, *values)`` on pieces of ``range(n)``; the threads end with the call: forks are safe."""
         if self._threads == 1 or n < MIN_PARALLEL:
             kernel(0, n, *values)
             return
         bounds = np.linspace(0, n, PIECES * self._threads + 1).astype(np.int64).tolist()
-        with ThreadPoolExecutor(self._threads) as pool:
-            list(pool.map(lambda start, stop: kernel(start, stop, *values), bounds[:-1], bounds[1:]))
+        pieces = iter(list(pairwise(bounds)))
+
+        def work() -> None:
+            for start, stop in pieces:
+                kernel(start, stop, *values)
+
+        with ThreadPoolExecutor(self._threads - 1) as pool:
+            others = [pool.submit(work) for _ in range(self._threads - 1)]
+            work()
+        for other in others:
+            other.result()

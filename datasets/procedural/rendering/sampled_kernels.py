@@ -14,7 +14,7 @@ from su3d_bench.core.compiled import njit
 from su3d_bench.datasets.procedural.materials import Texture
 from su3d_bench.datasets.procedural.rendering.noise_kernels import noise3
 from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
-from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference, aim
+from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference
 
 compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 inlined: Any = njit(cache=True, inline="never")
@@ -29,54 +29,45 @@ SMOOTH_COSINE = 0.92  # between the facets of a curved surface
 @compiled
 def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, material, is_edge):  # type: ignore[no-untyped-def]
     """Marks the pixels of rows ``start`` to ``stop`` with a neighbour on another object, material or plane."""
-    for row in range(start, stop):
-        for column in range(width):
-            i = row * width + column
-            hit, is_edge[i] = t[i] < 1e9, False
-            f = triangle[i] if hit else 0
-            for k in range(4):
-                j = i + (k == 0) - (k == 1) + width * ((k == 2) - (k == 3))
-                if (k == 0 and column == width - 1) or (k == 1 and column == 0) or not 0 <= j < t.shape[0]:
+    for i in range(start * width, stop * width):
+        column, hit = i % width, t[i] < 1e9
+        f = triangle[i] if hit else 0
+        nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+        height = t[i] * (nx * rays[i, 3] + ny * rays[i, 4] + nz * rays[i, 5])
+        is_edge[i] = False
+        for k in range(4):
+            j = i + (k == 0) - (k == 1) + width * ((k == 2) - (k == 3))
+            if (k == 0 and column == width - 1) or (k == 1 and column == 0) or not 0 <= j < t.shape[0]:
+                continue
+            g = triangle[j]
+            if f == g or not (hit or t[j] < 1e9):
+                continue
+            if hit and t[j] < 1e9 and instance[f] == instance[g] and material[f] == material[g]:
+                alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
+                off = t[j] * (nx * rays[j, 3] + ny * rays[j, 4] + nz * rays[j, 5]) - height
+                if alike > SMOOTH_COSINE and abs(off) < 0.002 * t[i] + 0.001:
                     continue
-                g = triangle[j]
-                if f == g or not (hit or t[j] < 1e9):
-                    continue
-                if hit and t[j] < 1e9 and instance[f] == instance[g] and material[f] == material[g]:
-                    nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
-                    alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
-                    off = t[j] * (nx * rays[j, 3] + ny * rays[j, 4] + nz * rays[j, 5])
-                    off -= t[i] * (nx * rays[i, 3] + ny * rays[i, 4] + nz * rays[i, 5])
-                    if alike > SMOOTH_COSINE and abs(off) < 0.002 * t[i] + 0.001:
-                        continue
-                is_edge[i] = True
-                break
+            is_edge[i] = True
+            break
 
 
 @compiled
-def aim_part(start, stop, directions, pose, rays):  # type: ignore[no-untyped-def]
-    aim(directions[start:stop], pose, rays[start:stop])
+def aim_at_borders(is_edge, inverse, pose, number, rays):  # type: ignore[no-untyped-def]
+    """Numbers the left (0) and top (1) borders of edge pixels, and fills the rays of their samples; returns how many.
 
-
-@compiled
-def aim_at_borders(is_edge, focal_inverse, pose, number, rays):  # type: ignore[no-untyped-def]
-    """Numbers the left (0) and top (1) borders of the edge pixels, and fills the rays of their samples; returns how many.
-
-    In the order of pixels, so that neighbours follow each other.
+    In the order of pixels, so that neighbours follow each other; ``inverse`` is that of the intrinsics.
     """
-    _, height, width = number.shape
-    n, m = 0, focal_inverse
-    for row in range(height):
-        for column in range(width):
-            i = row * (width - 1) + column
-            inside = row < height - 1, column < width - 1
-            here = inside[0] and inside[1] and is_edge[i]
+    n, height, width = 0, number.shape[1] - 1, number.shape[2] - 1
+    for row in range(height + 1):
+        for column in range(width + 1):
+            i = row * width + column
+            here = row < height and column < width and is_edge[i]
             shift = BORDER_SHIFT if (row + column) % 2 == 0 else -BORDER_SHIFT
             for k in range(2):
-                if here or (k == 0 and column > 0 and inside[0] and is_edge[i - 1]) or (
-                    k == 1 and row > 0 and inside[1] and is_edge[i - width + 1]
-                ):
+                is_there = (column > 0 and row < height) if k == 0 else (row > 0 and column < width)
+                if here or (is_there and is_edge[i - (1 if k == 0 else width)]):
                     u, v = (column - 0.5, row + shift) if k == 0 else (column - shift, row - 0.5)
-                    x, y = u * m[0, 0] + v * m[0, 1] + m[0, 2], u * m[1, 0] + v * m[1, 1] + m[1, 2]
+                    x, y = u * inverse[0, 0] + inverse[0, 2], v * inverse[1, 1] + inverse[1, 2]
                     for c in range(3):
                         rays[n, c], rays[n, 3 + c] = pose[c, 3], pose[c, 0] * x + pose[c, 1] * y + pose[c, 2]
                     number[k, row, column] = n
@@ -89,7 +80,7 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, step, pixel, is_last, v
                texture, light, face_normals, material, rows, lights, colour, tint, onward):  # fmt: skip
     """Fills ``colour`` (N, 3) of rays ``start`` to ``stop``, and how they go on: ``tint`` (N, 3) and ray ``onward``.
 
-    ``across`` and ``down`` are the steps of a ray's direction to the next pixels, zero for one sample of the texture;
+    ``step`` (2, 3) is how a ray's direction changes to the pixels right and below, zero for one sample of the texture;
     ``pixel`` is the width of a sample at a distance of 1.
     ``is_last`` makes glass and mirrors opaque.
     """
@@ -187,13 +178,14 @@ def wear_off(texture, material, materials, light):  # type: ignore[no-untyped-de
 
 @inlined
 def _highlight(nx, ny, nz, dx, dy, dz, wx, wy, wz, lights, gloss):  # type: ignore[no-untyped-def]
+    """As in ``shade_kernels``, without the square root and division of lights that are not near the reflection."""
     facing = dx * nx + dy * ny + dz * nz
     rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
     total = gloss * 0.10 * max(0.0, rz + 0.2)
     for k in range(lights.shape[0]):
         lx, ly, lz = lights[k, 0] - wx, lights[k, 1] - wy, lights[k, 2] - wz
         along, square = rx * lx + ry * ly + rz * lz, lx * lx + ly * ly + lz * lz
-        if along > 0 and along * along > 0.63 * square:
+        if along > 0 and along * along > 0.63 * square:  # below 0.8 squared, for any rounding
             cosine = along / (math.sqrt(square) + 1e-6)
             if cosine > 0.8:
                 total += gloss * 0.5 * lights[k, 3] * cosine ** (20.0 + 60.0 * gloss)
@@ -202,6 +194,10 @@ def _highlight(nx, ny, nz, dx, dy, dz, wx, wy, wz, lights, gloss):  # type: igno
 
 @inlined
 def _step(a, b, e1, e2, nx, ny, nz, dx, dy, dz, facing, far, turn):  # type: ignore[no-untyped-def]
+    """Change of the texture coordinates on a triangle's plane if a ray's direction changes by ``turn``.
+
+    ``a`` and ``b`` are two edges of the triangle, ``e1`` and ``e2`` the same in texture coordinates.
+    """
     lean = turn[0] * nx + turn[1] * ny + turn[2] * nz
     lean /= facing if abs(facing) > 1e-3 else 1e-3
     wx, wy, wz = far * (turn[0] - lean * dx), far * (turn[1] - lean * dy), far * (turn[2] - lean * dz)
@@ -225,13 +221,10 @@ def encode(start, stop, width, colour, is_edge, number, samples, gain, codes, t,
             i = row * width + column
             hit = t[i] < 1e9
             depth[i], ids[i] = t[i] if hit else 0.0, instance[triangle[i]] if hit else 0
-            left = right = top = bottom = 0
-            if is_edge[i]:
-                left, right = number[0, row, column], number[0, row, column + 1]
-                top, bottom = number[1, row, column], number[1, row + 1, column]
             for k in range(3):
                 value = colour[i, k]
                 if is_edge[i]:
-                    value = samples[left, k] + samples[right, k] + samples[top, k] + samples[bottom, k]
-                    value /= np.float32(4)
+                    value = samples[number[0, row, column], k] + samples[number[0, row, column + 1], k]
+                    value += samples[number[1, row, column], k]
+                    value = (value + samples[number[1, row + 1, column], k]) / np.float32(4)
                 rgb[i, k] = codes[min(CODES - 1, int(math.sqrt(max(value * gain, 0.0)) * (CODES / 4)))]
