@@ -72,11 +72,13 @@ class Renderer:
     ) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
         from su3d_bench.datasets.procedural.rendering.shade_kernels import aim
 
-        o3d = compiled_open3d()
-
         rays = np.empty((len(directions), 6), np.float32)
         aim(directions, pose, rays)
-        answer = self._scene.cast_rays(o3d.core.Tensor(rays))
+        return self._hits(rays)
+
+    def _hits(self, rays: Float32Array) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
+        """``rays`` (N, 6), and for each the distance, triangle and barycentric coordinates of what it hits."""
+        answer = self._scene.cast_rays(compiled_open3d().core.Tensor.from_numpy(rays))
         return rays, answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
 
 

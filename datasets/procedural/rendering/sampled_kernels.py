@@ -14,12 +14,13 @@ from su3d_bench.core.compiled import njit
 from su3d_bench.datasets.procedural.materials import Texture
 from su3d_bench.datasets.procedural.rendering.noise_kernels import noise3
 from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
-from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference, _highlight
+from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference
 
 compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 inlined: Any = njit(cache=True, inline="never")
 
 SAMPLES = np.array([[-0.375, -0.125], [0.375, 0.125], [0.125, -0.375], [-0.125, 0.375]])  # rotated grid, in pixels
+BORDER_SHIFT = 0.25  # of a sample along its border, in pixels
 ALIKE = 0.03  # two of the four samples suffice if they differ less, in linear light
 PLAIN, WALL, STAINS = (int(kind) for kind in (Texture.PLAIN, Texture.WALL, Texture.STAINS))
 SMOOTH_COSINE = 0.92  # between the facets of a curved surface
@@ -51,18 +52,43 @@ def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, ma
 
 
 @compiled
-def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, pixel, is_last, vertices, triangles, normals,  # type: ignore[no-untyped-def]
-               texture, light, face_normals, material, materials, lights, colour, tint, onward):  # fmt: skip
+def aim_at_borders(is_edge, inverse, pose, number, rays):  # type: ignore[no-untyped-def]
+    """Numbers the left (0) and top (1) borders of edge pixels, and fills the rays of their samples; returns how many.
+
+    In the order of pixels, so that neighbours follow each other; ``inverse`` is that of the intrinsics.
+    """
+    n, height, width = 0, number.shape[1] - 1, number.shape[2] - 1
+    for row in range(height + 1):
+        for column in range(width + 1):
+            i = row * width + column
+            here = row < height and column < width and is_edge[i]
+            shift = BORDER_SHIFT if (row + column) % 2 == 0 else -BORDER_SHIFT
+            for k in range(2):
+                is_there = (column > 0 and row < height) if k == 0 else (row > 0 and column < width)
+                if here or (is_there and is_edge[i - (1 if k == 0 else width)]):
+                    u, v = (column - 0.5, row + shift) if k == 0 else (column - shift, row - 0.5)
+                    x, y = u * inverse[0, 0] + inverse[0, 2], v * inverse[1, 1] + inverse[1, 2]
+                    for c in range(3):
+                        rays[n, c], rays[n, 3 + c] = pose[c, 3], pose[c, 0] * x + pose[c, 1] * y + pose[c, 2]
+                    number[k, row, column] = n
+                    n += 1
+    return n
+
+
+@compiled
+def shade_rays(start, stop, rays, t, triangle, uv, skip, step, pixel, is_last, vertices, triangles, normals,  # type: ignore[no-untyped-def]
+               texture, light, face_normals, material, rows, lights, colour, tint, onward):  # fmt: skip
     """Fills ``colour`` (N, 3) of rays ``start`` to ``stop``, and how they go on: ``tint`` (N, 3) and ray ``onward``.
 
-    ``across`` and ``down`` are the steps of a ray's direction to the next pixels, zero for one sample of the texture;
+    ``step`` (2, 3) is how a ray's direction changes to the pixels right and below, zero for one sample of the texture;
     ``pixel`` is the width of a sample at a distance of 1.
     ``is_last`` makes glass and mirrors opaque.
     """
-    is_filtered = across[0] != 0 or across[1] != 0 or across[2] != 0
+    across, down = (step[0, 0], step[0, 1], step[0, 2]), (step[1, 0], step[1, 1], step[1, 2])
+    is_filtered = across != (0.0, 0.0, 0.0)
     for i in range(start, stop):
-        tint[i] = 0.0
-        colour[i] = 0.0
+        tint[i, 0] = tint[i, 1] = tint[i, 2] = 0.0
+        colour[i, 0] = colour[i, 1] = colour[i, 2] = 0.0
         far = t[i]
         if skip[i] or not far < 1e9:
             continue
@@ -74,7 +100,7 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, pixel, is
         dx, dy, dz = rays[i, 3], rays[i, 4], rays[i, 5]
         facing = nx * dx + ny * dy + nz * dz
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        row = materials[material[f]]
+        row = rows[material[f]]  # a record: views of arrays are counted, with atomic operations
         x, y, z = _between(texture, i0, i1, i2, b0, b1, b2)
         e1x, e1y, e1z = _difference(texture, i1, i0)
         e2x, e2y, e2z = _difference(texture, i2, i0)
@@ -87,8 +113,10 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, pixel, is
         is_smooth = kind == PLAIN or (z > 0.1 + foot and (kind == STAINS or (kind == WALL and row[10] == 0)))
         if is_filtered and not is_smooth:
             n = 4
-            gux, guy, guz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, across, texture)
-            gvx, gvy, gvz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, down, texture)
+            a, b = _difference(vertices, i1, i0), _difference(vertices, i2, i0)
+            e1, e2 = (e1x, e1y, e1z), (e2x, e2y, e2z)
+            gux, guy, guz = _step(a, b, e1, e2, nx, ny, nz, dx, dy, dz, facing, far, across)
+            gvx, gvy, gvz = _step(a, b, e1, e2, nx, ny, nz, dx, dy, dz, facing, far, down)
         r, g, b = 0.0, 0.0, 0.0
         for k in range(n):
             su, sv = (SAMPLES[k, 0], SAMPLES[k, 1]) if n > 1 else (0.0, 0.0)
@@ -111,7 +139,9 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, pixel, is
         shine = gloss * fresnel * min(1.0, 0.7 * mean)
         spark = 0.0
         if gloss > 0.1:
-            spark = _highlight(i, far, b0, b1, b2, i0, i1, i2, normals, rays[:, 3:], rays[i, :3], lights, gloss)
+            mx, my, mz = _between(normals, i0, i1, i2, b0, b1, b2)
+            wx, wy, wz = rays[i, 0] + far * dx, rays[i, 1] + far * dy, rays[i, 2] + far * dz
+            spark = _highlight(mx, my, mz, dx / length, dy / length, dz / length, wx, wy, wz, lights, gloss)
             spark *= min(1.0, 1.3 * mean) * (0.6 + 2.0 * fresnel)
         own = 1.0
         if not is_last and (mirror > 0 or clear > 0):
@@ -147,28 +177,54 @@ def wear_off(texture, material, materials, light):  # type: ignore[no-untyped-de
 
 
 @inlined
-def _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, turn, texture):  # type: ignore[no-untyped-def]
-    """Change of the texture coordinates on a triangle's plane if a ray's direction changes by ``turn``."""
+def _highlight(nx, ny, nz, dx, dy, dz, wx, wy, wz, lights, gloss):  # type: ignore[no-untyped-def]
+    """As in ``shade_kernels``, without the square root and division of lights that are not near the reflection."""
+    facing = dx * nx + dy * ny + dz * nz
+    rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
+    total = gloss * 0.10 * max(0.0, rz + 0.2)
+    for k in range(lights.shape[0]):
+        lx, ly, lz = lights[k, 0] - wx, lights[k, 1] - wy, lights[k, 2] - wz
+        along, square = rx * lx + ry * ly + rz * lz, lx * lx + ly * ly + lz * lz
+        if along > 0 and along * along > 0.63 * square:  # below 0.8 squared, for any rounding
+            cosine = along / (math.sqrt(square) + 1e-6)
+            if cosine > 0.8:
+                total += gloss * 0.5 * lights[k, 3] * cosine ** (20.0 + 60.0 * gloss)
+    return np.float32(total)
+
+
+@inlined
+def _step(a, b, e1, e2, nx, ny, nz, dx, dy, dz, facing, far, turn):  # type: ignore[no-untyped-def]
+    """Change of the texture coordinates on a triangle's plane if a ray's direction changes by ``turn``.
+
+    ``a`` and ``b`` are two edges of the triangle, ``e1`` and ``e2`` the same in texture coordinates.
+    """
     lean = turn[0] * nx + turn[1] * ny + turn[2] * nz
     lean /= facing if abs(facing) > 1e-3 else 1e-3
     wx, wy, wz = far * (turn[0] - lean * dx), far * (turn[1] - lean * dy), far * (turn[2] - lean * dz)
-    ax, ay, az = _difference(vertices, i1, i0)
-    bx, by, bz = _difference(vertices, i2, i0)
+    ax, ay, az = a
+    bx, by, bz = b
     aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
     wa, wb = wx * ax + wy * ay + wz * az, wx * bx + wy * by + wz * bz
     scale = 1.0 / max(aa * bb - ab * ab, 1e-20)
     u, v = (wa * bb - wb * ab) * scale, (wb * aa - wa * ab) * scale
-    ux, uy, uz = _difference(texture, i1, i0)
-    vx, vy, vz = _difference(texture, i2, i0)
-    return u * ux + v * vx, u * uy + v * vy, u * uz + v * vz
+    return u * e1[0] + v * e2[0], u * e1[1] + v * e2[1], u * e1[2] + v * e2[2]
 
 
 CODES = 4096  # entries of the table of encoded values, by the square root of linear light up to 16
 
 
 @compiled
-def encode(start, stop, colour, gain, codes, rgb):  # type: ignore[no-untyped-def]
-    for i in range(start, stop):
-        for k in range(3):
-            value = colour[i, k] * gain
-            rgb[i, k] = codes[min(CODES - 1, int(math.sqrt(max(value, 0.0)) * (CODES / 4)))]
+def encode(start, stop, width, colour, is_edge, number, samples, gain, codes, t, triangle, instance, rgb, depth, ids):  # type: ignore[no-untyped-def]
+    """Fills ``rgb``, ``depth`` and ``ids`` of rows ``start`` to ``stop``; an edge has the mean of its four samples."""
+    for row in range(start, stop):
+        for column in range(width):
+            i = row * width + column
+            hit = t[i] < 1e9
+            depth[i], ids[i] = t[i] if hit else 0.0, instance[triangle[i]] if hit else 0
+            for k in range(3):
+                value = colour[i, k]
+                if is_edge[i]:
+                    value = samples[number[0, row, column], k] + samples[number[0, row, column + 1], k]
+                    value += samples[number[1, row, column], k]
+                    value = (value + samples[number[1, row + 1, column], k]) / np.float32(4)
+                rgb[i, k] = codes[min(CODES - 1, int(math.sqrt(max(value * gain, 0.0)) * (CODES / 4)))]
