@@ -380,8 +380,8 @@ class _Scene(SceneData):
             configured = jobs.with_visible_truth(part, rules, base, prediction, first)
             names = tuple(rules.prompt_names.get(entry.name, entry.name) for entry in rules.classes)
             asked = rules.with_names(corruption.names(names)) if corruption and corruption.at("names") else rules
-            # Points far outside what was seen do not mean that the map is in another frame.
-            score = score_located if seen is None else score_scene
+            # Points far outside what was seen, or under wrong poses, do not mean that the map is in another frame.
+            score = score_located if seen is None and not part.corruption else score_scene
             scores[rules.name] = score(asked, known, configured, encoder)
         return scores, unscored
 
