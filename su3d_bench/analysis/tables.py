@@ -48,7 +48,7 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
     measured = [row for path in paths if is_scores(path) for row in _annotated_rows(path)]
     first: dict[str, tuple[FinishedRun, Measured]] = {}
     for name, run in runs.items():
-        for row in _results_of(name, run):
+        for row in results_of(name, run):
             if row.protocol in first and first[row.protocol][0] is not run:
                 other, known = first[row.protocol]
                 common = sorted(known.scenes & row.scenes)
@@ -143,7 +143,8 @@ def _annotator_summary(scores: Scores, cells: Sequence[ScoreCell]) -> str:
     return f"judged by {counted(n_people, 'annotator')}, {counted(n_items, 'item')}{of}"
 
 
-def _results_of(name: str, run: FinishedRun) -> list[Measured]:
+def results_of(name: str, run: FinishedRun) -> list[Measured]:
+    """The results of every method and protocol of ``run``, called ``name``."""
     names = {one.protocol: one.result.metrics for one in run.results.values() if one.result is not None}
     return [_measured(name, run, one, names.get(one.protocol, one.headline)) for one in run.results.values()]
 
