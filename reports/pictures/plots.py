@@ -25,7 +25,7 @@ from su3d_bench.reports.pictures.canvas import (
     fitted,
     write_figure,
 )
-from su3d_bench.reports.tables.costs import COSTS, CostRow, comparable_rows, front_of, names_of
+from su3d_bench.reports.tables.costs import COSTS, RATE, CostRow, comparable_rows, front_of, points_of
 from su3d_bench.reports.tables.instances import LEFT, n_text
 from su3d_bench.reports.tables.timing import AnytimePoint
 
@@ -46,7 +46,6 @@ PANELS_PER_ROW: dict[Width, int] = {"8cm": 1, "17cm": 2}  # so that a panel is a
 LEGEND_COLUMNS, HANDLE_LETTERS = 3, 7
 MIB = 2**20
 NARROW, WIDE = 6, 60  # ratio of axis limits below and above which 1, 2, 5 per decade are too few and too many ticks
-RATE, COST_PANELS = "frames per second that arrive", ("frame_s", "map_s", "peak_rss_bytes", "saved_bytes")
 POINTS, UPDATES = "number of map points", "number of updates"
 
 
@@ -54,14 +53,15 @@ POINTS, UPDATES = "number of map points", "number of updates"
 def draw_timing(
     times: Sequence[Sequence[UpdateTimes]],
     anytime: Sequence[AnytimePoint],
+    costs: Sequence[CostRow],
     warm_up: int,
     folder: Path,
     width: Width = "17cm",
 ) -> list[Path]:
     """Write the plots as PNG and PDF and return their paths.
 
-    ``update-cost`` over map points (if a method counts them), ``update-course`` over updates, ``memory``, ``stages``
-    and, if intermediate maps were scored, ``anytime``.
+    ``update-cost`` over map points (if a method counts them), ``update-course`` over updates, ``memory``, ``stages``,
+    ``anytime`` if intermediate maps were scored, and one ``cost-quality`` per machine, protocol and set of scenes.
     """
     figures = {
         "update-cost": _update_cost(times, warm_up, POINTS, width),
@@ -73,6 +73,7 @@ def draw_timing(
         del figures["update-cost"]
     if _curves(anytime):
         figures["anytime"] = _anytime(anytime, width)
+    figures |= {f"cost-quality-{k}": _costs(rows, width) for k, rows in enumerate(comparable_rows(costs), 1)}
     paths = {folder / f"{name}.{kind}": figure for name, figure in figures.items() for kind in ("png", "pdf")}
     for path, figure in paths.items():
         write_figure(figure, path)
@@ -273,56 +274,29 @@ def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
     return figure
 
 
-@figure_style()
-def draw_costs(rows: Sequence[CostRow], folder: Path, width: Width = "17cm") -> list[Path]:
-    """Write ``cost-quality`` as PNG and PDF, one per machine, protocol and set of scenes, and return the paths.
-
-    The first headline metric over the rate of a real-time run and over each cost; a line connects the rates of a
-    method, markers without filling are in real time, and a grey line is the Pareto front.
-    """
-    groups = comparable_rows(rows)
-    paths = []
-    for number, group in enumerate(groups, 1):
-        figure, stem = _costs(group, width), f"cost-quality-{number}" if len(groups) > 1 else "cost-quality"
-        for kind in ("png", "pdf"):
-            caption = f"{group[0].score.protocol} on {group[0].machine}"
-            write_figure(figure, folder / f"{stem}.{kind}", caption)
-            paths.append(folder / f"{stem}.{kind}")
-    return paths
-
-
 def _costs(rows: Sequence[CostRow], width: Width) -> Figure:
-    over = [cost for cost in COST_PANELS if any(row.costs[cost] is not None for row in rows)]
-    if all(row.costs["frame_s"] is not None for row in rows if any(row.costs.values())):
-        over.remove("map_s")
-    elif "frame_s" in over:
-        over.remove("frame_s")  # one panel must not lack rows that the others show
-    rates = [RATE] if any(row.rate_hz for row in rows) else []
-    figure, panels = figure_with_panels(width, *[2.2] * (len(rates) + len(over)))
-    names = names_of(rows)
-    for axes, cost in zip(panels, [*rates, *over], strict=True):
+    """Plot the first headline metric over each cost, with the Pareto front.
+
+    A line connects the runs of a method; markers without filling are in real time.
+    """
+    drawn = [cost for cost in COSTS if not cost.startswith("n_") and points_of(rows, cost)]
+    figure, panels = figure_with_panels(width, *[2.2] * len(drawn))
+    for axes, cost in zip(panels, drawn, strict=True):
         if cost != RATE:
-            front = [(row.costs[cost] or 0.0) / COSTS[cost][1] for row in front_of(rows, cost)]
-            heights = [100 * (row.quality or 0.0) for row in front_of(rows, cost)]
-            axes.step(front, heights, where="post", color="0.7", linewidth=2.5, label="Pareto front")
-        for index, name in enumerate(dict.fromkeys(names)):
-            mine = [row for row, of_row in zip(rows, names, strict=True) if of_row == name and row.quality is not None]
-            points = [(row, row.rate_hz if cost == RATE else row.costs[cost]) for row in mine]
-            shown = [(row, x / (1 if cost == RATE else COSTS[cost][1])) for row, x in points if x]
-            style = style_of_line(index) | {"linewidth": 0.6}
-            axes.plot([x for _, x in shown], [_percent(row) for row, _ in shown], **style, label=printable(name, 60))
-            live = [(x, _percent(row)) for row, x in shown if row.rate_hz]
+            x, y, _ = zip(*front_of(rows, cost), strict=True)
+            axes.step(x, y, where="post", color="0.75", linewidth=3, label="Pareto front")
+        for index, method in enumerate(dict.fromkeys(row.score.method for row in rows)):
+            points = points_of([row for row in rows if row.score.method == method], cost)
+            style = style_of_line(index) | {"linewidth": 0.6, "label": printable(method, 60)}
+            axes.plot([x for x, _, _ in points], [y for _, y, _ in points], **style)
+            live = [(x, y) for x, y, row in points if row.costs[RATE] is not None]
             axes.plot(*np.reshape(live, (-1, 2)).T, style["marker"], color=style["color"], markerfacecolor="white")
-        protocol, metric = rows[0].score.protocol, rows[0].score.headline[0]
-        axes.set(xscale="log", xlabel=cost if cost == RATE else COSTS[cost][0], ylabel=f"{protocol}: {metric} (%)")
+        axes.set(xscale="log", xlabel=COSTS[cost], ylabel=f"{rows[0].score.protocol}:\n{rows[0].score.headline[0]} (%)")
         _number_by_1_2_5(axes.xaxis)
         axes.grid(True)
+    figure.suptitle(fitted(rows[0].machine, WIDTHS_IN[width]), fontsize=8)
     draw_legend(figure, panels)
     return figure
-
-
-def _percent(row: CostRow) -> float:
-    return 100 * (row.quality or 0.0)
 
 
 # Shades and hatches distinguish the bars in black and white.

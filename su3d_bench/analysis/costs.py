@@ -7,62 +7,46 @@ from collections.abc import Mapping, Sequence
 from su3d_bench.analysis.tables import results_of
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import printable
-from su3d_bench.metrics.costs import MAP, WARM_UP, UpdateTimes, summarise
-from su3d_bench.reports.tables.costs import CostRow
+from su3d_bench.metrics.costs import MAP, UpdateTimes, summarise
+from su3d_bench.reports.tables.costs import COSTS, RATE, TIME, CostRow
 from su3d_bench.runs.finished import FinishedRun
-
-SIZES = ("peak_rss_bytes", "device_bytes", "saved_bytes", "n_points")
-
-
-def rate_of(run: FinishedRun) -> float | None:
-    """Frames that arrive per second in a real-time run; None if every frame waits for the method."""
-    return run.settings.get(("realtime",)) or None
+from su3d_bench.store.records import NumbersRecord
 
 
 def machine_of(run: FinishedRun, times: Sequence[UpdateTimes]) -> str:
-    """The machine whose times count: that of the run, or of a schedule that was measured elsewhere or simulated."""
-    here = run.record.hardware
-    clocks = [updates.realtime for updates in times if updates.realtime is not None]
-    of_clocks = {f"{one.device}{' (simulated)' if one.is_simulated else ''}" for one in clocks}
-    others = sorted(of_clocks - {here})
-    return f"{', '.join(others)}; memory of {here}" if others else here
+    """The machine of the run, and those on which its schedules were measured elsewhere or simulated."""
+    clocks = [one.realtime for one in times if one.realtime is not None]
+    devices = [f"{clock.device}{' (simulated)' if clock.is_simulated else ''}" for clock in clocks]
+    return printable(", ".join(dict.fromkeys([run.record.hardware, *devices])), 300)
 
 
-def costs_of(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> dict[str, float | None]:
-    """The costs of a method in seconds, bytes and points; None if unknown, as without any processed frame."""
-    summary = summarise(times, warm_up) if times else None
-    map_ms = next((stage.p50 for stage in summary.stages if stage.name == MAP), None) if summary else None
-    ms = {"frame_s": summary and summary.frame_ms, "map_s": map_ms}
-    return {
-        **{name: value / 1e3 if value is not None and value == value else None for name, value in ms.items()},
-        **{name: getattr(summary, name, None) for name in SIZES},
-    }
+def costs_of(run: FinishedRun, times: Sequence[UpdateTimes], score: NumbersRecord) -> dict[str, float | None]:
+    """The costs of a method by the keys of ``COSTS``, None if unknown: all but the rate if it processed no frame."""
+    costs: dict[str, float | None] = dict.fromkeys(COSTS) | {RATE: run.settings.get(("realtime",)) or None}
+    if times:
+        one = summarise(times)
+        map_ms = next(stage.p50 for stage in one.stages if stage.name == MAP)
+        ms = {TIME: one.frame_ms, "map_s": map_ms if map_ms == map_ms else None}
+        n_bytes = {"peak_mib": one.peak_rss_bytes, "gpu_mib": one.device_bytes, "saved_mib": one.saved_bytes}
+        costs |= {name: None if value is None else value / 1e3 for name, value in ms.items()}
+        costs |= {name: None if value is None else value / 2**20 for name, value in n_bytes.items()}
+        costs |= {"n_points": one.n_points, "n_instances": max(score.n_predictions.values(), default=None)}
+    return costs
 
 
-def cost_rows(
-    runs: Sequence[FinishedRun], timed: Mapping[tuple[str, str], Sequence[UpdateTimes]], warm_up: int
-) -> list[CostRow]:
-    """The scores and costs of each method whose frames were timed; ``timed``: by names of run and method.
+def cost_rows(runs: Sequence[FinishedRun], timed: Mapping[tuple[str, str], Sequence[UpdateTimes]]) -> list[CostRow]:
+    """The scores and costs of the methods whose frames were timed; ``timed``: by names of run and method.
 
     A method that finished no frame in real time has a score and no costs.
     """
     rows = []
-    for run in runs:
-        for score in results_of(run.name, run):
-            times = timed.get((run.name, score.method), ())
-            if not score.per_scene or score.is_ceiling or not (times or rate_of(run)):
-                continue
-            record = run.results[score.method, score.protocol].result
-            n_instances = None if record is None else max(record.n_predictions.values(), default=None)
-            data = {scene: run.record.data_digests.get(scene) for scene in score.scenes}
-            rules = run.protocols[score.protocol].digest
-            rows.append(
-                CostRow(
-                    score=score,
-                    machine=printable(machine_of(run, times), 300),
-                    data=digest_json([score.protocol, rules, score.limit, data]),
-                    rate_hz=rate_of(run),
-                    costs=costs_of(times, warm_up) | {"n_instances": n_instances},
-                )
-            )
+    for run, score in [(each, score) for each in runs for score in results_of(each.name, each)]:
+        times, result = timed.get((run.name, score.method)), run.results[score.method, score.protocol].result
+        if times is None or result is None or score.is_ceiling:
+            continue
+        costs = costs_of(run, times, result)
+        if times or costs[RATE]:
+            data = {scene: run.record.data_digests.get(scene) for scene in result.scenes}
+            key = digest_json([score.protocol, run.protocols[score.protocol].digest, score.limit, data])
+            rows.append(CostRow(score, machine_of(run, times), key, costs))
     return rows

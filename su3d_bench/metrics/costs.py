@@ -42,7 +42,7 @@ class UpdateTimes:
     start_ms: float | None = None
     close_ms: float | None = None
     realtime: RealTimeRecord | None = None
-    frame_ms: Float64Array | None = None
+    frame_ms: Sequence[float] | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -122,6 +122,7 @@ def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSum
     n_updates = len(pool.total_ms)
     n_frames = sum(_frames_covered(updates) for updates in times)
     last = [updates.maps[-1] for updates in times if updates.maps]
+    frame_ms = [updates.frame_ms for updates in times if updates.frame_ms is not None]
     return MethodSummary(
         run=times[0].run,
         method=times[0].method,
@@ -136,7 +137,7 @@ def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSum
         peak_rss_bytes=_largest([updates.peak_rss_bytes for updates in times if updates.peak_rss_bytes is not None]),
         device_bytes=_largest([updates.device_bytes for updates in times if updates.device_bytes is not None]),
         saved_bytes=_largest([one.n_bytes for one in last if one.n_bytes is not None]),
-        frame_ms=_median_frame_ms(times, warm_up),
+        frame_ms=float(np.median(np.concatenate(frame_ms))) if len(frame_ms) == len(times) else None,
     )
 
 
@@ -170,14 +171,6 @@ class _Pool:
             against_instances=growth_exponent(self._instances[self._is_steady], steady),
             against_frames=growth_exponent(self._number[self._is_steady], steady),
         )
-
-
-def _median_frame_ms(times: Sequence[UpdateTimes], warm_up: int) -> float | None:
-    """The median over all scenes; the first updates count if there are no others."""
-    known = [updates.frame_ms for updates in times if updates.frame_ms is not None]
-    steady = np.concatenate([ms[warm_up:] for ms in known] or [np.zeros(0)])
-    values = steady if len(steady) else np.concatenate([*known, np.zeros(0)])
-    return float(np.median(values)) if len(known) == len(times) and len(values) else None
 
 
 def pareto_front(costs: Sequence[float], scores: Sequence[float]) -> list[int]:

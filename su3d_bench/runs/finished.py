@@ -13,7 +13,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from pydantic import ValidationError
 
 from su3d_bench.core import registry
@@ -34,7 +33,6 @@ from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
-from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
@@ -407,14 +405,14 @@ def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
     return times
 
 
-def _frame_ms(run: FinishedRun, job: JobFolder, columns: Mapping[str, Float64Array]) -> Float64Array | None:
+def _frame_ms(run: FinishedRun, job: JobFolder, columns: Mapping[str, Any]) -> list[float] | None:
     """Milliseconds (N,) of perception and method per update; None if perception may have been read from files.
 
     In real time those of the schedule: the updates that ``updates.csv`` times only repeat it.
     """
     if is_file(job.schedule):
-        return np.array(read_schedule(job.schedule).fed_ms)
+        return read_schedule(job.schedule).fed_ms
     is_stored = bool({*(run.record.profile or "").split(", ")} & {*NOT_TIMED})
     if is_stored or run.settings.get(("perception", "cache")) is not False:
         return None
-    return columns["total_ms"] - columns.get("decode_ms", 0.0)
+    return list(columns["total_ms"] - columns.get("decode_ms", 0.0))

@@ -221,9 +221,10 @@ function linePlot({ label, lines, xLabel, yLabel, width = 760, height = 300, mos
     const d = one.x.map((v, i) => `${i ? 'L' : 'M'}${px(v).toFixed(1)} ${py(one.y[i]).toFixed(1)}`).join('');
     plot.append(svg('path', { class: `line l${one.style % 8}`, d, 'stroke-dasharray': DASHES[one.style % 8] },
       svg('title', null, one.name)));
+    const titleOf = (i) => (one.titles || [])[i] || one.name;
     const ring = { class: `l${one.style % 8}`, fill: 'none', 'stroke-width': 1.6, r: 2.6 };
     if (one.x.length < 30) one.x.forEach((v, i) => plot.append(svg('circle', { ...ring, cx: px(v), cy: py(one.y[i]) },
-      svg('title', null, `${one.name}: ${countText(one.y[i])}`))));
+      svg('title', null, `${titleOf(i)}: ${countText(one.y[i])}`))));
   }
   if (isSmall) return plot;
   return h('div', null, lineKey(lines), scrollBox(label, plot),
