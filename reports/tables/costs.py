@@ -69,7 +69,7 @@ def _table(number: int, rows: Sequence[CostRow]) -> Table:
     best = {(cost, id(row)) for cost in costs if cost != RATE for _, _, row in front_of(rows, cost)}
     body = []
     for row, label in zip(rows, labels_of(scores), strict=True):
-        rate, *cells = [Cell(_number(row.costs[cost]), is_best=(cost, id(row)) in best) for cost in costs]
+        rate, *cells = [Cell(cost_text(row.costs[cost]), is_best=(cost, id(row)) in best) for cost in costs]
         body.append(TableRow(label, (rate, *cells_of(row.score, shown, set()), *cells), group=row.score.method))
     columns = (COSTS[RATE], *shown.metrics, *(COSTS[cost] for cost in costs[1:]))
     notes = (units(scores[0], shown), *NOTES[: 1 + any(row.costs[TIME] is None for row in rows)])
@@ -77,7 +77,8 @@ def _table(number: int, rows: Sequence[CostRow]) -> Table:
     return Table(f"costs-{number}", caption, "method", columns, tuple(body), notes, "Cost and quality")
 
 
-def _number(value: float | None) -> str:
+def cost_text(value: float | None) -> str:
+    """Return three significant digits, or all before the point; ``-`` for None."""
     return NOT_MEASURED if value is None else f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 

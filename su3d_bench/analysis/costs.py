@@ -1,4 +1,8 @@
-"""The scores of finished runs beside their costs: time per frame, memory, size of the map."""
+"""The scores of finished runs beside their costs: time per frame, memory, size of the map.
+
+Times are those of perception and method; reading a frame takes none, as in real time. A real-time run has the times of
+its schedule, because its maps are made by a second pass. Sizes are the largest over the scenes.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +25,21 @@ def machine_of(run: FinishedRun, times: Sequence[UpdateTimes]) -> str:
 
 
 def costs_of(run: FinishedRun, times: Sequence[UpdateTimes], score: NumbersRecord) -> dict[str, float | None]:
-    """The costs of a method by the keys of ``COSTS``, None if unknown: all but the rate if it processed no frame."""
+    """The costs of a method by the keys of ``COSTS``: Hz, seconds, MiB, points and instances; None if unknown.
+
+    ``times``: its updates in each scene, none if it finished no frame in real time; ``score``: its result under any
+    protocol, for the number of instances.
+    """
     costs: dict[str, float | None] = dict.fromkeys(COSTS) | {RATE: run.settings.get(("realtime",)) or None}
     if times:
         one = summarise(times)
-        map_ms = next(stage.p50 for stage in one.stages if stage.name == MAP)
-        ms = {TIME: one.frame_ms, "map_s": map_ms if map_ms == map_ms else None}
+        ms = {TIME: one.frame_ms, "map_s": next(stage.p50 for stage in one.stages if stage.name == MAP)}
         n_bytes = {"peak_mib": one.peak_rss_bytes, "gpu_mib": one.device_bytes, "saved_mib": one.saved_bytes}
-        costs |= {name: None if value is None else value / 1e3 for name, value in ms.items()}
-        costs |= {name: None if value is None else value / 2**20 for name, value in n_bytes.items()}
-        costs |= {"n_points": one.n_points, "n_instances": max(score.n_predictions.values(), default=None)}
+        costs |= {name: value / 1e3 for name, value in ms.items() if value is not None and value == value}
+        costs |= {name: value / 2**20 for name, value in n_bytes.items() if value is not None}
+        costs["n_points"] = one.n_points
+        if "n_instances" in times[0].columns:  # otherwise the predictions are points
+            costs["n_instances"] = max(score.n_predictions.values(), default=None)
     return costs
 
 

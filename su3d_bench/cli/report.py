@@ -141,8 +141,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
     rows = cost_rows(runs, timed)
     of_costs, costs = cost_tables(rows), cost_values(rows)
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate, list(chain(*times))) + of_costs
-    methods = [asdict(summary) for summary in summaries]
-    value: dict[str, Any] = {"hardware": hardware, "methods": methods, "cost_quality": costs}
+    value: dict[str, Any] = {"hardware": hardware, "methods": list(map(asdict, summaries)), "cost_quality": costs}
     if clocked := [one for one in chain(*times) if one.realtime is not None]:
         value["real_time"] = [{"scene": one.scene, "method": one.method, **vars(one.realtime)} for one in clocked]
     output.answer_tables(arguments, value, tables)

@@ -86,7 +86,8 @@ def _evaluation(run: FinishedRun, method: str) -> str:
 NOT_STATED = "not stated"
 USES_GROUND_TRUTH = "none: it uses ground truth"
 NO_WEIGHTS = {"oracle": "none: ground-truth masks", "stored": f"{NOT_STATED}: detections of another program"}
-ROW_FILES = ("counts.npz", "updates.csv", "schedule.csv", "done.json")  # files of a job that a row needs; its map stays in the archive
+# Files of a job that a row needs; its map stays in the archive.
+ROW_FILES = ("counts.npz", "updates.csv", "schedule.csv", "done.json")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, signed, with_interval
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.page.page import PAGE, Kind, page_name, registry_page_html
-from su3d_bench.reports.tables.costs import COSTS
+from su3d_bench.reports.tables.costs import COSTS, cost_text
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry import SUFFIX, Registry, Row
 from su3d_bench.runs.finished import AS_SUBMITTED
@@ -212,7 +212,7 @@ def _plain_tables(registry: Registry) -> Table | Prose:
                 Cell(_headline(row)),
                 Cell(NOT_MEASURED if row.ranks is None else " to ".join(map(str, row.ranks))),
                 Cell(str(len(row.scenes))),
-                *(Cell(NOT_MEASURED if value is None else f"{value:.3g}") for value in row.costs.values()),
+                *(Cell(cost_text(value)) for value in row.costs.values()),
                 Cell(row.hardware),
                 Cell(row.trained_on),
                 *([Cell(_changes(row))] if has_changes else []),

@@ -27,8 +27,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def row(method: str, score: float | None, machine: str = "here", **costs: float) -> CostRow:
     measured = Measured(
         run=f"runs/{costs.get('rate_hz', 'waits')}", method=method, protocol="rooms-semantic", version=1,
-        kind="semantic", headline=("mAcc",), metrics={"mAcc": score}, intervals={}, per_scene={"rooms/a": {"mAcc": score}},
-        n_planned=1, caveat=None,
+        kind="semantic", headline=("mAcc",), metrics={"mAcc": score}, intervals={},
+        per_scene={"rooms/a": {"mAcc": score}}, n_planned=1, caveat=None,
     )  # fmt: skip
     return CostRow(measured, machine, "data", dict.fromkeys(COSTS) | costs)
 

@@ -33,7 +33,7 @@ function costPlots(entries) {
         .sort((a, b) => (a.rate_hz || Infinity) - (b.rate_hz || Infinity)))).filter((one) => one.x.length);
       const front = key === 'rate_hz' ? [] : [line('Pareto front', methods.length, frontOf(mine))];
       return [h('p', { class: 'intro' }, machine), linePlot({ label: `${name} against ${xLabel} on ${machine}`,
-        lines: [...lines, ...front], xLabel, yLabel: isCount(name) ? name : `${name} in per cent` })];
+        lines: [...front, ...lines], xLabel, yLabel: isCount(name) ? name : `${name} in per cent` })];
     }));
   }
   draw();
