@@ -277,7 +277,7 @@ def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
 def _costs(rows: Sequence[CostRow], width: Width) -> Figure:
     """Plot the first headline metric over each cost, with the Pareto front.
 
-    A line connects the runs of a method; markers without filling are in real time.
+    Markers without filling are in real time; a line connects the rates of a method.
     """
     drawn = [cost for cost in COSTS if not cost.startswith("n_") and points_of(rows, cost)]
     figure, panels = figure_with_panels(width, *[2.2] * len(drawn))
@@ -287,7 +287,7 @@ def _costs(rows: Sequence[CostRow], width: Width) -> Figure:
             axes.step(x, y, where="post", color="0.75", linewidth=3, label="Pareto front")
         for index, method in enumerate(dict.fromkeys(row.score.method for row in rows)):
             points = points_of([row for row in rows if row.score.method == method], cost)
-            style = style_of_line(index) | {"linewidth": 0.6, "label": printable(method, 60)}
+            style = style_of_line(index) | {"linewidth": float(cost == RATE), "label": printable(method, 60)}
             axes.plot([x for x, _, _ in points], [y for _, y, _ in points], **style)
             live = [(x, y) for x, y, row in points if row.costs[RATE] is not None]
             axes.plot(*np.reshape(live, (-1, 2)).T, style["marker"], color=style["color"], markerfacecolor="white")

@@ -12,10 +12,10 @@ from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown, cells_of, labels_of, units
 
 RATE, TIME = "rate_hz", "frame_s"
-COSTS = {RATE: "Hz", TIME: "s per frame", "map_s": "s without perception", "peak_mib": "peak MiB"}
+COSTS = {RATE: "rate (Hz)", TIME: "s per frame", "map_s": "s without perception", "peak_mib": "peak MiB"}
 COSTS |= {"gpu_mib": "GPU MiB", "saved_mib": "saved map, MiB", "n_points": "points", "n_instances": "instances"}
 NOTES = (
-    "Hz: frames that arrive per second in real time; -: every frame waits for the method. Times: medians of an update "
+    "Rate: frames that arrive per second in real time; -: each frame waits for the method. Times: medians of an update "
     "without reading the frame; all other costs: the largest of the scenes. Bold: no other row has a higher first "
     "metric at this cost or less. Rows of other machines, rules or scenes are in tables of their own.",
     "s per frame is missing where perception may be read from files; run with --set perception.cache=false",
@@ -72,7 +72,8 @@ def _table(number: int, rows: Sequence[CostRow]) -> Table:
         rate, *cells = [Cell(cost_text(row.costs[cost]), is_best=(cost, id(row)) in best) for cost in costs]
         body.append(TableRow(label, (rate, *cells_of(row.score, shown, set()), *cells), group=row.score.method))
     columns = (COSTS[RATE], *shown.metrics, *(COSTS[cost] for cost in costs[1:]))
-    notes = (units(scores[0], shown), *NOTES[: 1 + any(row.costs[TIME] is None for row in rows)])
+    is_untimed = any(row.costs["peak_mib"] and row.costs[TIME] is None for row in rows)
+    notes = (units(scores[0], shown), *NOTES[: 1 + is_untimed])
     caption = f": {scores[0].protocol} on {rows[0].machine}."
     return Table(f"costs-{number}", caption, "method", columns, tuple(body), notes, "Cost and quality")
 

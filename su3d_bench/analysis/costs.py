@@ -19,8 +19,7 @@ from su3d_bench.store.records import NumbersRecord
 
 def machine_of(run: FinishedRun, times: Sequence[UpdateTimes]) -> str:
     """The machine of the run, and those on which its schedules were measured elsewhere or simulated."""
-    clocks = [one.realtime for one in times if one.realtime is not None]
-    devices = [f"{clock.device}{' (simulated)' if clock.is_simulated else ''}" for clock in clocks]
+    devices = [f"{one.device}{' (simulated)' if one.is_simulated else ''}" for each in times if (one := each.realtime)]
     return printable(", ".join(dict.fromkeys([run.record.hardware, *devices])), 300)
 
 

@@ -30,7 +30,7 @@ function costPlots(entries) {
     place.replaceChildren(...unique(points.map(groupOf)).flatMap((group) => {
       const mine = points.filter((one) => groupOf(one) === group), { machine } = mine[0];
       const lines = methods.map((method, k) => line(method, k, mine.filter((one) => one.method === method)
-        .sort((a, b) => (a.rate_hz || Infinity) - (b.rate_hz || Infinity)))).filter((one) => one.x.length);
+        .sort((a, b) => a.x - b.x))).filter((one) => one.x.length).map((one) => ({ ...one, isScatter: key !== 'rate_hz' }));
       const front = key === 'rate_hz' ? [] : [line('Pareto front', methods.length, frontOf(mine))];
       return [h('p', { class: 'intro' }, machine), linePlot({ label: `${name} against ${xLabel} on ${machine}`,
         lines: [...front, ...lines], xLabel, yLabel: isCount(name) ? name : `${name} in per cent` })];
