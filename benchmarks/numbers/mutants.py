@@ -70,7 +70,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/identity.py": ("test_identity",),
     "metrics/tracked_points.py": ("test_identity",),
     "metrics/seen.py": ("test_seen_truth", "runs/test_seen_so_far"),
-    "metrics/costs.py": ("reports/test_timing_report",),
+    "metrics/costs.py": ("reports/test_timing_report", "analysis/test_cost_quality"),
     "metrics/compatibility.py": (*_PROTOCOLS, "evaluation/test_labels_counted"),
     "metrics/protocols/": _PROTOCOLS,
     "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),

@@ -22,7 +22,7 @@ HERE = Path(__file__).parent
 REGISTRY = HERE.parent / "registry"
 SCRIPTS = (  # in execution order
     *("elements", "maps/shaders", "maps/view", "maps/cloud", "sections", "maps/paint", "maps/link", "maps/pane"),
-    *("maps/scene", "gallery", "errors", "timing", "compare", "robustness", "page"),
+    *("maps/scene", "gallery", "errors", "costs", "timing", "compare", "robustness", "page"),
 )
 STYLE = "page.css"
 TEMPLATE = "page.html.j2"
@@ -73,8 +73,8 @@ def registry_page_html(
     kind: Kind, title: str, data: Mapping[str, Any], without_scripts: Sequence[Table | Prose] = ()
 ) -> str:
     """Return a page of a registry site. ``data``: plain values; ``without_scripts``: shown without JavaScript."""
-    parts = (file_text(HERE / "scripts" / "elements.js"), file_text(REGISTRY / "page.js"))
-    script = "(() => {\n'use strict';\n" + "\n".join(parts) + "\n})();\n"
+    files = (HERE / "scripts/elements.js", HERE / "scripts/costs.js", REGISTRY / "page.js")
+    script = "(() => {\n'use strict';\n" + "\n".join(map(file_text, files)) + "\n})();\n"
     return rendered(
         REGISTRY,
         script,

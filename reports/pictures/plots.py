@@ -25,6 +25,7 @@ from su3d_bench.reports.pictures.canvas import (
     fitted,
     write_figure,
 )
+from su3d_bench.reports.tables.costs import COSTS, RATE, CostRow, comparable_rows, front_of, points_of
 from su3d_bench.reports.tables.instances import LEFT, n_text
 from su3d_bench.reports.tables.timing import AnytimePoint
 
@@ -52,14 +53,15 @@ POINTS, UPDATES = "number of map points", "number of updates"
 def draw_timing(
     times: Sequence[Sequence[UpdateTimes]],
     anytime: Sequence[AnytimePoint],
+    costs: Sequence[CostRow],
     warm_up: int,
     folder: Path,
     width: Width = "17cm",
 ) -> list[Path]:
     """Write the plots as PNG and PDF and return their paths.
 
-    ``update-cost`` over map points (if a method counts them), ``update-course`` over updates, ``memory``, ``stages``
-    and, if intermediate maps were scored, ``anytime``.
+    ``update-cost`` over map points (if a method counts them), ``update-course`` over updates, ``memory``, ``stages``,
+    ``anytime`` if intermediate maps were scored, and one ``cost-quality`` per machine, protocol and set of scenes.
     """
     figures = {
         "update-cost": _update_cost(times, warm_up, POINTS, width),
@@ -71,6 +73,7 @@ def draw_timing(
         del figures["update-cost"]
     if _curves(anytime):
         figures["anytime"] = _anytime(anytime, width)
+    figures |= {f"cost-quality-{k}": _costs(rows, width) for k, rows in enumerate(comparable_rows(costs), 1)}
     paths = {folder / f"{name}.{kind}": figure for name, figure in figures.items() for kind in ("png", "pdf")}
     for path, figure in paths.items():
         write_figure(figure, path)
@@ -268,6 +271,31 @@ def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
         axes.set(xlabel="seconds until the map was available", ylabel=f"{protocol}: {name} (%)")
         axes.grid(True)
     draw_legend(figure, all_axes)
+    return figure
+
+
+def _costs(rows: Sequence[CostRow], width: Width) -> Figure:
+    """Plot the first headline metric over each cost, with the Pareto front.
+
+    Markers without filling are in real time; a line connects the rates of a method.
+    """
+    drawn = [cost for cost in COSTS if not cost.startswith("n_") and points_of(rows, cost)]
+    figure, panels = figure_with_panels(width, *[2.2] * len(drawn))
+    for axes, cost in zip(panels, drawn, strict=True):
+        if cost != RATE:
+            x, y, _ = zip(*front_of(rows, cost), strict=True)
+            axes.step(x, y, where="post", color="0.75", linewidth=3, label="Pareto front")
+        for index, method in enumerate(dict.fromkeys(row.score.method for row in rows)):
+            points = points_of([row for row in rows if row.score.method == method], cost)
+            style = style_of_line(index) | {"linewidth": float(cost == RATE), "label": printable(method, 60)}
+            axes.plot([x for x, _, _ in points], [y for _, y, _ in points], **style)
+            live = [(x, y) for x, y, row in points if row.costs[RATE] is not None]
+            axes.plot(*np.reshape(live, (-1, 2)).T, style["marker"], color=style["color"], markerfacecolor="white")
+        axes.set(xscale="log", xlabel=COSTS[cost], ylabel=f"{rows[0].score.protocol}:\n{rows[0].score.headline[0]} (%)")
+        _number_by_1_2_5(axes.xaxis)
+        axes.grid(True)
+    figure.suptitle(fitted(rows[0].machine, WIDTHS_IN[width]), fontsize=8)
+    draw_legend(figure, panels)
     return figure
 
 

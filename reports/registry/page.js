@@ -22,6 +22,9 @@ const datasetsOf = (board) => board.datasets.join(', ');
 const scenesText = (board) => `${plural(board.scenes.length, 'scene')} of ${datasetsOf(board)}`;
 // Without the CPU family and model numbers, which are on the method's page.
 const shortHardware = (row) => row.hardware.replace(/ \(cpu family[^)]*\)/, '');
+const SIZES = [['rate_hz', 'Real time, Hz'], ['peak_mib', 'Peak MiB'], ['gpu_mib', 'GPU MiB'], ['saved_mib', 'Saved map, MiB'],
+  ['n_points', 'Points'], ['n_instances', 'Instances']];
+const sizeText = (value) => (isNumber(value) ? countText(Number(value.toPrecision(3))) : '–');
 const ranksText = (row) => (!row.ranks ? '–'
   : row.ranks[0] === row.ranks[1] ? String(row.ranks[0]) : `${row.ranks[0]} to ${row.ranks[1]}`);
 
@@ -82,8 +85,10 @@ function boardTable(board, rows) {
     ...metrics,
     ...(rows.some((row) => row.changes.length) ? [words('Change under corruptions, points', changesOf)] : []),
     { label: 'Time per frame, as submitted', title: 'Median time per processed frame, not measured again; in brackets without perception', num: true,
-      value: (row) => row.update_s,
-      show: (row) => [seconds(row.update_s), isNumber(row.map_s) ? h('small', null, ` (${seconds(row.map_s)})`) : null] },
+      value: (row) => row.costs.frame_s, show: (row) => [seconds(row.costs.frame_s),
+        isNumber(row.costs.map_s) ? h('small', null, ` (${seconds(row.costs.map_s)})`) : null] },
+    ...SIZES.filter(([key]) => rows.some((row) => isNumber(row.costs[key]))).map(([key, label]) => (
+      { label, num: true, value: (row) => row.costs[key], show: (row) => sizeText(row.costs[key]) })),
     words('Authors', (row) => row.authors, { show: authorsOf }),
     { label: 'Date', num: true, value: (row) => row.date || null, show: (row) => row.date || '–' },
     words('Hardware', (row) => shortHardware(row)),
@@ -148,7 +153,9 @@ function indexPage() {
         && (!text || says(row, board).includes(text)));
       n += rows.length;
       places[k].made.hidden = !rows.length;
-      places[k].place.replaceChildren(boardTable(board, rows));
+      const costs = rows.flatMap((row) => board.headline.map((metric, j) => (
+        { method: row.method, metric, value: row.values[j], machine: row.hardware, ...row.costs })));
+      places[k].place.replaceChildren(boardTable(board, rows), costPlots(costs));
     });
     count.textContent = `${n === all.length ? '' : `${n} of `}${plural(all.length, 'row')}`;
   }
@@ -183,9 +190,10 @@ function methodPage() {
       pictureOf(row), facts([
         [`Mean change of ${board.headline[0]} under corruptions, points`, changesOf(row)],
         ['Authors', authorsOf(row)], ['Date', row.date],
-        ['Time per frame, as submitted', isNumber(row.update_s)
-          ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception (median of ${plural(row.n_updates, 'frame')}, `
-            + 'excluding the first of each scene)' : 'not measured'],
+        ['Time per frame, as submitted', row.n_updates
+          ? `${seconds(row.costs.frame_s)}, ${seconds(row.costs.map_s)} without perception (median of `
+            + `${plural(row.n_updates, 'frame')})` : 'not measured'],
+        ...SIZES.map(([key, label]) => [label, isNumber(row.costs[key]) ? sizeText(row.costs[key]) : null]),
         ['Hardware', row.hardware], ['Perception profile', row.profile], ['Encoder', row.encoder],
         ['Weights trained on', row.trained_on], ['Settings', row.changed.join(', ')],
         ['Command', h('code', null, row.command)], ['Bundle', bundleText(row)],

@@ -48,7 +48,7 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
     measured = [row for path in paths if is_scores(path) for row in _annotated_rows(path)]
     first: dict[str, tuple[FinishedRun, Measured]] = {}
     for name, run in runs.items():
-        for row in _results_of(name, run):
+        for row in results_of(name, run):
             if row.protocol in first and first[row.protocol][0] is not run:
                 other, known = first[row.protocol]
                 common = sorted(known.scenes & row.scenes)
@@ -143,7 +143,7 @@ def _annotator_summary(scores: Scores, cells: Sequence[ScoreCell]) -> str:
     return f"judged by {counted(n_people, 'annotator')}, {counted(n_items, 'item')}{of}"
 
 
-def _results_of(name: str, run: FinishedRun) -> list[Measured]:
+def results_of(name: str, run: FinishedRun) -> list[Measured]:
     names = {one.protocol: one.result.metrics for one in run.results.values() if one.result is not None}
     return [_measured(name, run, one, names.get(one.protocol, one.headline)) for one in run.results.values()]
 
@@ -203,12 +203,12 @@ def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) ->
 
 
 def _seconds_until(times: UpdateTimes, index: int, share: float) -> float:
-    """Seconds of the updates before a map, or before the last one if the scene has fewer, and of finishing it; in real
-    time those of the recording."""
+    """Seconds of the updates before a map, or before the last one if the scene has fewer, and of finishing it, without
+    reading frames; in real time those of the recording."""
     if times.realtime is not None:
         return share * times.realtime.duration_s
     made = times.maps[min(index, len(times.maps) - 1)]
-    return float(times.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
+    return float((times.ms("total") - times.ms("decode"))[: made.n_updates].sum() + made.finish_ms) / 1e3
 
 
 def choose(

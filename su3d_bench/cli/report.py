@@ -102,28 +102,33 @@ def _add_timing(verbs: Verbs) -> None:
     parser.shared("--methods")
     parser.option("--warm-up N", "first updates of a scene to exclude as warm-up (default: 3)", type=index, default=3)
     parser.option("--camera-rate HZ", "frame rate, for the real-time factor (default: 30)", type=positive, default=30.0)
-    parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots", type=output_path)
+    parser.option("--out DIR", "folder for tables (.md, .csv and .tex) and plots", type=output_path)
     parser.shared("--width", "--format")
 
 
 def call_timing(arguments: argparse.Namespace) -> None:
-    """Report the time per update and stage, and whether it grows with the map.
+    """Report the time per update and stage, whether it grows with the map, and cost against quality.
 
     su3d-bench report timing runs/demo
     su3d-bench report timing runs/a runs/b --out timing --camera-rate 20
     """
+    from su3d_bench.analysis.costs import cost_rows
     from su3d_bench.analysis.tables import anytime_points
     from su3d_bench.core.files.atomic import make_folder, write_text
+    from su3d_bench.formats.tables.table import csv_lines
     from su3d_bench.metrics.costs import summarise
     from su3d_bench.reports.pictures.plots import draw_timing
+    from su3d_bench.reports.tables.costs import cost_tables, cost_values
     from su3d_bench.reports.tables.formats import markdown
+    from su3d_bench.reports.tables.latex import latex
     from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
     from su3d_bench.runs.finished import read_update_times
     from su3d_bench.runs.verify import read_checked
 
     runs = [read_checked(path) for path in arguments.runs]
-    timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
-    times = [each for each in timed if each]
+    jobs = [(run, method) for run in runs for method in arguments.methods or run.methods]
+    timed = {(run.name, method): read_update_times(run, method) for run, method in jobs}
+    times = [each for each in timed.values() if each]
     if not times:
         are_elsewhere = any(run.external for run in runs)
         why = "imported predictions have no timings" if are_elsewhere else "their methods process no frames"
@@ -131,8 +136,10 @@ def call_timing(arguments: argparse.Namespace) -> None:
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in anytime_points(runs, each)]
     hardware = {run.name: run.hardware for run in runs}
-    tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate, list(chain(*times)))
-    value: dict[str, Any] = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
+    rows = cost_rows(runs, timed)
+    of_costs, costs = cost_tables(rows), cost_values(rows)
+    tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate, list(chain(*times))) + of_costs
+    value: dict[str, Any] = {"hardware": hardware, "methods": list(map(asdict, summaries)), "cost_quality": costs}
     if clocked := [one for one in chain(*times) if one.realtime is not None]:
         value["real_time"] = [{"scene": one.scene, "method": one.method, **vars(one.realtime)} for one in clocked]
     output.answer_tables(arguments, value, tables)
@@ -143,8 +150,10 @@ def call_timing(arguments: argparse.Namespace) -> None:
     write_text(arguments.out / "timing.md", markdown(tables))
     write_text(arguments.out / "timing.csv", csv_text(summaries, hardware))
     write_text(arguments.out / "methods.csv", methods_csv(summaries, hardware, arguments.camera_rate))
-    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out, arguments.width)
-    files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv")]
+    write_text(arguments.out / "costs.csv", csv_lines([*costs[:1], *(one.values() for one in costs)]))
+    write_text(arguments.out / "costs.tex", latex(of_costs))
+    pictures = draw_timing(times, anytime, rows, arguments.warm_up, arguments.out, arguments.width)
+    files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv", "costs.csv", "costs.tex")]
     remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
 
 

@@ -27,7 +27,8 @@ class UpdateTimes:
     ``columns`` has (N,) float64 for every column of ``updates.csv``: ``total_ms``, ``method_ms``, one ``<stage>_ms``
     per stage, sizes. ``maps`` are the intermediate ones and the last; what was not measured is None.
     ``calibration_ms``: the time of a fixed workload, measured between the updates; ``start_ms`` and ``close_ms``: of
-    the method before the first frame and after the last map. ``realtime``: the clock of a real-time run.
+    the method before the first frame and after the last map. ``realtime``: the clock of a real-time run. ``frame_ms``
+    (N,): perception and method, without reading the frame; None if perception was not timed.
     """
 
     run: str
@@ -41,6 +42,7 @@ class UpdateTimes:
     start_ms: float | None = None
     close_ms: float | None = None
     realtime: RealTimeRecord | None = None
+    frame_ms: Sequence[float] | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -92,7 +94,8 @@ class MethodSummary:
     """The cost of a method over the scenes of a run; the last rows of ``stages`` are ``map`` and ``total``.
 
     ``map`` is the whole time of the method without perception. ``frames_per_s`` counts frames at full rate, of which
-    every stride-th is an update. Bytes are the largest over the scenes, None if not measured.
+    every stride-th is an update. Bytes are the largest over the scenes, None if not measured; ``saved_bytes``: of the
+    last map on disk. ``frame_ms``: median of perception and method.
     """
 
     run: str
@@ -107,6 +110,8 @@ class MethodSummary:
     map_bytes: int | None
     peak_rss_bytes: int | None
     device_bytes: int | None
+    saved_bytes: int | None
+    frame_ms: float | None
 
 
 def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSummary:
@@ -116,7 +121,8 @@ def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSum
     seconds = float(pool.total_ms.sum()) / 1e3
     n_updates = len(pool.total_ms)
     n_frames = sum(_frames_covered(updates) for updates in times)
-    last = [updates.maps[-1].finish_ms for updates in times if updates.maps]
+    last = [updates.maps[-1] for updates in times if updates.maps]
+    frame_ms = [updates.frame_ms for updates in times if updates.frame_ms is not None]
     return MethodSummary(
         run=times[0].run,
         method=times[0].method,
@@ -125,11 +131,13 @@ def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSum
         stages=tuple(pool.stage(name) for name in (*stages, MAP, TOTAL)),
         updates_per_s=n_updates / seconds if seconds else float("nan"),
         frames_per_s=n_frames / seconds if seconds else float("nan"),
-        finish_ms=max(last) if last else None,
+        finish_ms=max((one.finish_ms for one in last), default=None),
         n_points=_largest([updates.columns["n_points"].max() for updates in times if "n_points" in updates.columns]),
         map_bytes=_largest([updates.columns["map_bytes"].max() for updates in times if "map_bytes" in updates.columns]),
         peak_rss_bytes=_largest([updates.peak_rss_bytes for updates in times if updates.peak_rss_bytes is not None]),
         device_bytes=_largest([updates.device_bytes for updates in times if updates.device_bytes is not None]),
+        saved_bytes=_largest([one.n_bytes for one in last if one.n_bytes is not None]),
+        frame_ms=float(np.median(np.concatenate(frame_ms))) if len(frame_ms) == len(times) else None,
     )
 
 
@@ -163,6 +171,19 @@ class _Pool:
             against_instances=growth_exponent(self._instances[self._is_steady], steady),
             against_frames=growth_exponent(self._number[self._is_steady], steady),
         )
+
+
+def pareto_front(costs: Sequence[float], scores: Sequence[float]) -> list[int]:
+    """The points, by rising cost, for which no other has a higher score at the same cost or less.
+
+    >>> pareto_front([3.0, 1.0, 2.0, 2.0], [0.3, 0.1, 0.3, 0.2])
+    [1, 2]
+    """
+    front: list[int] = []
+    for k in sorted(range(len(costs)), key=lambda k: (costs[k], -scores[k])):
+        if not front or scores[k] > scores[front[-1]]:
+            front.append(k)
+    return front
 
 
 def _largest(values: Sequence[float]) -> int | None:

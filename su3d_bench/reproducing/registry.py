@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.analysis.costs import costs_of, machine_of
 from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of, in_order, ranked
 from su3d_bench.core import registry as plugins
 from su3d_bench.core.config import NEUTRAL_SETTINGS, KeyPath, RunConfig, toml_value
@@ -18,11 +19,11 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
 from su3d_bench.core.system.files import opened
-from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
 from su3d_bench.reports.pictures.maps import thumbnail
+from su3d_bench.reports.tables.costs import RATE
 from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, copy_pieces, unpack, verify_bundle
 from su3d_bench.runs.catalogue import about_method
 from su3d_bench.runs.existing import existing_run
@@ -85,7 +86,8 @@ def _evaluation(run: FinishedRun, method: str) -> str:
 NOT_STATED = "not stated"
 USES_GROUND_TRUTH = "none: it uses ground truth"
 NO_WEIGHTS = {"oracle": "none: ground-truth masks", "stored": f"{NOT_STATED}: detections of another program"}
-ROW_FILES = ("counts.npz", "updates.csv", "done.json")  # files of a job that a row needs; its map stays in the archive
+# Files of a job that a row needs; its map stays in the archive.
+ROW_FILES = ("counts.npz", "updates.csv", "schedule.csv", "done.json")
 
 
 @dataclass(frozen=True)
@@ -112,15 +114,14 @@ class ModelWeights:
 class Row(RankingRow):
     """A method of a run under a protocol.
 
-    ``update_s`` and ``map_s``: median time per frame after the first ones of a scene, with and without perception; None
-    if no frame was timed. ``encoder``: the encoder whose features named the instances, None if the method did.
-    ``values_of_scenes``: scene -> one value per headline metric. ``picture``: PNG of the first map, if requested.
+    ``costs``: time, memory and map size, by the keys of ``COSTS``. ``encoder``: the encoder whose features named the
+    instances, None if the method did. ``values_of_scenes``: scene -> one value per headline metric. ``picture``: PNG of
+    the first map, if requested.
     """
 
     bundle: BundleFacts
     values_of_scenes: tuple[tuple[str, tuple[float | None, ...]], ...]
-    update_s: float | None
-    map_s: float | None
+    costs: Mapping[str, float | None]
     n_updates: int
     hardware: str
     encoder: str | None
@@ -220,7 +221,6 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
     record = run.results[entry.method, entry.protocol]
     assert record.result is not None  # otherwise there would be no entry
     times = read_update_times(run, entry.method)
-    stages = {stage.name: stage for stage in summarise(times, WARM_UP).stages} if times else {}
     per_scene = record.result.per_scene
     is_elsewhere = entry.method in run.external
     manifest = unpacked.manifest
@@ -234,10 +234,9 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
         values_of_scenes=tuple(
             (scene, tuple(per_scene[scene].get(metric) for metric in entry.headline)) for scene in entry.scenes
         ),
-        update_s=_seconds(stages[TOTAL].p50) if stages else None,
-        map_s=_seconds(stages[MAP].p50) if stages else None,
+        costs=costs_of(run, times, record.result),
         n_updates=sum(map(len, times)),
-        hardware=NOT_STATED if is_elsewhere else printable(run.record.hardware, 200),
+        hardware=NOT_STATED if is_elsewhere else machine_of(run, times),
         encoder=None if record.encoder is None else printable(record.encoder, 80),
         weights=() if is_elsewhere else tuple(_weights(run, record.encoder, record.profile)),
         stated_training_data=printable(manifest.trained_on, 400),
@@ -252,10 +251,6 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
         caveat=printable(record.caveat or "", 300),
         warnings=tuple(printable(line, 300) for line in record.result.warnings),
     )
-
-
-def _seconds(ms: float) -> float | None:
-    return ms / 1e3 if ms == ms else None
 
 
 def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iterator[ModelWeights]:
@@ -310,7 +305,8 @@ def _faults_beside(row: Row, other: Row) -> Iterator[str]:
         for model in mine.keys() & known.keys() & MODELS.keys():
             if MODELS[model].kind == "encoder" and mine[model] != known[model]:
                 yield f"its weights of {model} differ from those of {where} (other SHA-256); run it with the same file"
-    if is_of_ranking and row.method.casefold() == other.method.casefold():
+    is_of_rate = row.costs[RATE] == other.costs[RATE]
+    if is_of_ranking and is_of_rate and row.method.casefold() == other.method.casefold():
         yield (
             f"the name is taken by {where} on the same scenes; give the variant its own name, such as "
             f"{row.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"

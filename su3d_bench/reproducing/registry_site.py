@@ -16,6 +16,7 @@ from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, signed, with_interval
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.page.page import PAGE, Kind, page_name, registry_page_html
+from su3d_bench.reports.tables.costs import COSTS, cost_text
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry import SUFFIX, Registry, Row
 from su3d_bench.runs.finished import AS_SUBMITTED
@@ -27,7 +28,7 @@ KIND = "su3d-bench dev registry"  # identifies an earlier site
 MAX_ADDRESS_CHARACTERS = 500
 TITLE = "Registry of results"
 ROW_FIELDS = (  # fields of a row that pages show unchanged
-    "method", "values", "intervals", "ranks", "is_ceiling", "update_s", "map_s", "n_updates", "hardware", "profile",
+    "method", "values", "intervals", "ranks", "is_ceiling", "costs", "n_updates", "hardware", "profile",
     "encoder", "trained_on", "command", "changed", "changes", "caveat", "warnings", "code", "commit", "run", "authors",
     "link", "date",
 )  # fmt: skip
@@ -211,7 +212,7 @@ def _plain_tables(registry: Registry) -> Table | Prose:
                 Cell(_headline(row)),
                 Cell(NOT_MEASURED if row.ranks is None else " to ".join(map(str, row.ranks))),
                 Cell(str(len(row.scenes))),
-                Cell(NOT_MEASURED if row.update_s is None else f"{row.update_s:.3g}"),
+                *(Cell(cost_text(value)) for value in row.costs.values()),
                 Cell(row.hardware),
                 Cell(row.trained_on),
                 *([Cell(_changes(row))] if has_changes else []),
@@ -227,7 +228,7 @@ def _plain_tables(registry: Registry) -> Table | Prose:
         return Prose(("This registry has no rows.",))
     changes = ["change under corruptions, points"] if has_changes else []
     facts = ("hardware", "weights trained on", *changes, "authors", "date", "bundle")
-    columns = ("protocol", "values", "rank", "scenes", "s per frame", *facts)
+    columns = ("protocol", "values", "rank", "scenes", *COSTS.values(), *facts)
     return Table("registry", f"All rows, in per cent; times {AS_SUBMITTED}.", "method", columns, tuple(rows), ())
 
 

@@ -121,6 +121,11 @@ class Schedule:
         """The frames whose updates count: those that are finished before the end."""
         return tuple(frame for frame, _ in self._finished())
 
+    @property
+    def fed_ms(self) -> list[float]:
+        """The duration of each update that counts."""
+        return [(ns - (self.times[frame].started_ns or 0)) / 1e6 for frame, ns in self._finished()]
+
     def n_fed_by(self, share: float) -> int:
         """The number of updates that are finished when a fraction ``share`` of the recording has been shown."""
         return sum(finished_ns <= round(share * self.end_ns) for _, finished_ns in self._finished())

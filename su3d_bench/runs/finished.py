@@ -39,7 +39,9 @@ from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, 
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import recognise
+from su3d_bench.runs.clock import read_schedule
 from su3d_bench.runs.job import Part, build_dataset, part_of
+from su3d_bench.runs.real_time import NOT_TIMED
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, looks_like_scene, nearest_scene
 from su3d_bench.store import records
 from su3d_bench.store.predictions import read_prediction
@@ -398,5 +400,19 @@ def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
                 costs = records.checked(records.CostsRecord, job.remarks("predict").get("costs") or {})
             except (ValidationError, RecursionError) as error:
                 raise DataError(f"{where}: the costs in done.json are damaged; run the scene again") from error
-            times.append(UpdateTimes(run.name, scene, method, columns, **vars(costs)))
+            frame_ms = _frame_ms(run, job, columns)
+            times.append(UpdateTimes(run.name, scene, method, columns, **vars(costs), frame_ms=frame_ms))
     return times
+
+
+def _frame_ms(run: FinishedRun, job: JobFolder, columns: Mapping[str, Any]) -> list[float] | None:
+    """Milliseconds (N,) of perception and method per update; None if perception may have been read from files.
+
+    In real time those of the schedule: the updates that ``updates.csv`` times only repeat it.
+    """
+    if is_file(job.schedule):
+        return read_schedule(job.schedule).fed_ms
+    is_stored = bool({*(run.record.profile or "").split(", ")} & {*NOT_TIMED})
+    if is_stored or run.settings.get(("perception", "cache")) is not False:
+        return None
+    return list(columns["total_ms"] - columns.get("decode_ms", 0.0))

@@ -24,7 +24,7 @@ from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, me
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors import Event, Report
 from su3d_bench.runs.plugins import attribute_of
-from su3d_bench.store.predictions import write_prediction
+from su3d_bench.store.predictions import features_beside, write_prediction
 from su3d_bench.store.records import updates_text
 
 
@@ -253,6 +253,7 @@ class MethodFeed:
         write_prediction(path, prediction)
         costs = attribute_of(self._method, "finish_costs", {})
         own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
+        own["n_bytes"] = sum(file.stat().st_size for file in (path, features_beside(path)) if file.is_file())
         self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
 
     def updates_text(self) -> str:

@@ -231,11 +231,14 @@ class MetricsRecord:
 
 @dataclass(frozen=True)
 class MapCost:
-    """The cost of one map: the updates before it, milliseconds of ``finish``, and the part of perception in these."""
+    """The cost of one map: the updates before it, milliseconds of ``finish``, the part of perception in these, and the
+    bytes of its files.
+    """
 
     n_updates: Count
     finish_ms: Amount
     perception_ms: Amount = 0.0
+    n_bytes: Count | None = None
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,14 @@ import pytest
 from painted import ColourPerception
 from painted_runs import COLLECTOR, PAINTED, job, run, words
 
+from su3d_bench.analysis.costs import cost_rows
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.clock import read_schedule
+from su3d_bench.runs.finished import read_run
 from su3d_bench.store.records import CostsRecord, checked
 from su3d_bench.store.run_folder import JobFolder
 
@@ -87,7 +89,9 @@ def test_a_measured_run_feeds_the_frames_worked_out_by_hand(capsys: pytest.Captu
         "3.33",
     ]
     assert main(["report", "timing", "out", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["real_time"][0]["n_dropped"] == 7
+    value = json.loads(capsys.readouterr().out)
+    assert value["real_time"][0]["n_dropped"] == 7
+    assert {(one["rate_hz"], one["frame_s"]) for one in value["cost_quality"]} == {(10.0, 0.25)}
 
 
 @pytest.mark.usefixtures("painted_place", "clock")
@@ -152,6 +156,10 @@ def test_a_method_that_finishes_no_update_has_an_empty_map() -> None:
     Path("costs.csv").write_text("device,duration_ms\nslow,60000\n")
     assert run(*TEN_HZ, "--cost", "costs.csv", scenes="a") == 0
     assert [one.n_updates for one in costs(job()).maps] == [0, 0, 0]
+    assert {
+        (one.costs["rate_hz"], one.costs["frame_s"])
+        for one in cost_rows([read_run(Path("out"))], {("out", "collector"): []})
+    } == {(10.0, None)}
 
 
 @pytest.mark.usefixtures("painted_place", "clock")

@@ -102,6 +102,7 @@ def test_page_has_confusion_errors_timing_and_comparison_of_every_method(page: s
     assert len(methods) == 2
     assert [one["method"] for one in found["confusions"]] == methods
     assert [one["method"] for one in found["timing"]] == methods
+    assert {one["method"] for one in found["costs"]} == set(methods) and found["costs"][0]["saved_mib"] > 0
     assert [(one["method"], one["reason"]) for one in found["errors"]] == [(name, None) for name in methods]
     assert all(len(one["protocols"]) == 2 for one in found["errors"])
     assert [(one["left"], one["right"], one["reason"]) for one in found["comparisons"]] == [

@@ -103,7 +103,7 @@ def test_timing_report_prints_tables_and_writes_plots(
 ) -> None:
     assert main(["report", "timing", str(run), "--out", str(tmp_path), "--warm-up", "1"]) == 0
     shown = capsys.readouterr().out
-    assert shown.count("| collector |") == 1 + 2 * 3 * 4  # three curves of two protocols, with their areas
+    assert shown.count("| collector |") == 1 + 2 * 3 * 4 + 2  # three curves of two protocols, with areas; costs
     lines = [[cell.strip() for cell in line.split("|")] for line in shown.splitlines()]
     seen = [row[5:] for row in lines if row[3:5] == ["rooms-semantic", "seen so far: ceiling"]]
     assert [row[0] for row in seen] == ["10 %", "50 %", "100 %", "area"] and {row[2] for row in seen} == {"100.0"}

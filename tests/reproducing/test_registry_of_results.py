@@ -104,6 +104,14 @@ def test_features_of_two_encoders_conflict_if_the_protocol_requires_one(registry
     assert conflict_with(same, [replace(one, weights=weights[0])]) is None
 
 
+def test_a_method_may_have_one_row_per_rate_of_a_real_time_run(registry: Path) -> None:
+    (row, *_), _ = rows_of_bundle(registry / "bundles" / "bob.zip")
+    assert row.costs["saved_mib"] and row.costs["peak_mib"] and row.costs["rate_hz"] is None
+    other = replace(row, costs={**row.costs, "rate_hz": 5.0})
+    assert conflict_with(other, [row]) is None
+    assert "the name is taken by" in (conflict_with(other, [other]) or "")
+
+
 def test_link_of_a_bundle_is_an_https_address(made: Path, registry: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--link 'javascript:1': expected an address that starts with https://"):
         bundle_runs(tmp_path / "x.zip", [made / "runs" / "bob"], link="javascript:1")

@@ -193,7 +193,8 @@ function niceTicks(low, high, most) {
 const DASHES = [null, '6 3', '2 3', '9 3 2 3', '4 2', '1 2', '12 4', '7 2 2 2'];
 
 function linePlot({ label, lines, xLabel, yLabel, width = 760, height = 300, most = 0, isSmall = false }) {
-  // Lines: {name, style, x: [], y: [], band: [[low, high]]}; styles differ in colour and dash. The y axis reaches `most`.
+  // Lines: {name, style, x: [], y: [], band: [[low, high]], titles: [], isScatter}; styles differ in colour and dash. The y
+  // axis reaches `most`. Titles are of the points; a scatter has only points.
   // A small plot has no key and no download.
   const left = isSmall ? 40 : 62, right = 12, top = 22, bottom = 42;
   const xs = lines.flatMap((one) => one.x), ys = lines.flatMap((one) => one.y);
@@ -218,12 +219,13 @@ function linePlot({ label, lines, xLabel, yLabel, width = 760, height = 300, mos
     plot.append(svg('path', { class: `band l${one.style % 8}`, d: `M${[...edge(0), ...edge(1).reverse()].join('L')}Z` }));
   }
   for (const one of lines) {
-    const d = one.x.map((v, i) => `${i ? 'L' : 'M'}${px(v).toFixed(1)} ${py(one.y[i]).toFixed(1)}`).join('');
+    const d = one.x.map((v, i) => `${i && !one.isScatter ? 'L' : 'M'}${px(v).toFixed(1)} ${py(one.y[i]).toFixed(1)}`).join('');
     plot.append(svg('path', { class: `line l${one.style % 8}`, d, 'stroke-dasharray': DASHES[one.style % 8] },
       svg('title', null, one.name)));
+    const titleOf = (i) => (one.titles || [])[i] || one.name;
     const ring = { class: `l${one.style % 8}`, fill: 'none', 'stroke-width': 1.6, r: 2.6 };
     if (one.x.length < 30) one.x.forEach((v, i) => plot.append(svg('circle', { ...ring, cx: px(v), cy: py(one.y[i]) },
-      svg('title', null, `${one.name}: ${countText(one.y[i])}`))));
+      svg('title', null, `${titleOf(i)}: ${countText(one.y[i])}`))));
   }
   if (isSmall) return plot;
   return h('div', null, lineKey(lines), scrollBox(label, plot),

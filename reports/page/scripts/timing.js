@@ -14,6 +14,7 @@ function timingSection() {
     function draw() { below.replaceChildren(stageTimes(DATA.timing[side.input.value])); }
     draw();
     anytime(section);
+    costQuality(section);
   });
 }
 
@@ -78,6 +79,15 @@ function stageTimes(one) {
       { label: 'Growth with map size', value: growthWords },
     ],
   });
+}
+
+function costQuality(section) {
+  if (!DATA.costs.length) return;
+  const place = h('div'), protocols = protocolField([...new Set(DATA.costs.map((one) => one.protocol))]);
+  const draw = () => place.replaceChildren(costPlots(DATA.costs.filter((one) => one.protocol === protocols.protocol())));
+  section.append(h('h3', null, 'Cost and quality'), h('div', { class: 'toolbar' }, protocols), place);
+  chosen.listeners.push(draw);
+  draw();
 }
 
 function anytime(section) {

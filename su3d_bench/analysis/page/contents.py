@@ -15,6 +15,7 @@ import numpy as np
 
 from su3d_bench.analysis.attribution import Explained, JobCounts, attribution_of, explained_of
 from su3d_bench.analysis.comparison import compare_pairs
+from su3d_bench.analysis.costs import cost_rows
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.scene import SceneData
@@ -27,6 +28,7 @@ from su3d_bench.metrics.attribution.arrays import EvaluatedScene
 from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.reports.tables.costs import cost_values
 from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
@@ -117,10 +119,13 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
     results: list[dict[str, Any]] = []
     confusions: list[dict[str, Any]] = []
     timing: list[dict[str, Any]] = []
+    timed: dict[tuple[str, str], list[UpdateTimes]] = {}
     for index, run in enumerate(runs):
         results += [{"run": index, **_shown(result)} for result in run.results.values()]
         if reads_all:
-            timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
+            times = {method: read_update_times(run, method) for method in run.methods if run.has_scores(method)}
+            timing += [{"run": index, **_timing(of_method)} for of_method in times.values() if of_method]
+            timed |= {(run.name, method): of_method for method, of_method in times.items()}
             confusions += [{"run": index, **one} for method in run.methods for one in _confusions(run, method)]
     reported = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
     numbers = {
@@ -135,6 +140,7 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
         "confusions": confusions,
         "errors": errors,
         "timing": timing,
+        "costs": cost_values(cost_rows(runs, timed)),
         "comparisons": _comparisons(runs) if reads_all and any(map(is_scored, runs)) else [],
     }
     shown: dict[str, Any] = printable_json(numbers)
@@ -199,10 +205,7 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
     return confusions
 
 
-def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
-    times = read_update_times(run, method) if run.has_scores(method) else []
-    if not times:
-        return None
+def _timing(times: Sequence[UpdateTimes]) -> dict[str, Any]:
     return {**summary_data(summarise(times)), "series": {of_scene.scene: series_of(of_scene) for of_scene in times}}
 
 

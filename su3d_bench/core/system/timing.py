@@ -18,6 +18,8 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array
 
+GPUS = Path("/proc/driver/nvidia/gpus")  # one folder per GPU
+
 
 class Timer:
     """Collects the milliseconds of each stage of the current update; ``take`` returns and resets them.
@@ -171,12 +173,15 @@ def peak_memory_bytes() -> int | None:
 
 
 def hardware_line() -> str:
-    """One line about the machine: processor, cores, memory, system."""
+    """One line about the machine: processor, cores, memory, system, GPUs."""
     import psutil
 
     memory_gib = psutil.virtual_memory().total / 2**30
     name = processor_name()
-    return f"{name}, {os.cpu_count()} cores, {memory_gib:.0f} GiB, {platform.system()} {platform.machine()}"
+    line = f"{name}, {os.cpu_count()} cores, {memory_gib:.0f} GiB, {platform.system()} {platform.machine()}"
+    facts = [fact for file in sorted(GPUS.glob("*/information")) for fact in file.read_text().splitlines()]
+    gpus = [fact.partition(":")[2].strip() for fact in facts if fact.startswith("Model:")]
+    return ", ".join([line, *(f"{gpus.count(gpu)} x {gpu}" for gpu in dict.fromkeys(gpus))])
 
 
 def processor_name() -> str:
