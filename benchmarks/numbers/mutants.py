@@ -68,6 +68,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/questions/": _QUESTIONS,
     "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
     "metrics/identity.py": ("test_identity",),
+    "metrics/changes.py": ("metrics/test_changes", "analysis/test_changes_report"),
     "metrics/tracked_points.py": ("test_identity",),
     "metrics/seen.py": ("test_seen_truth", "runs/test_seen_so_far"),
     "metrics/costs.py": ("reports/test_timing_report", "analysis/test_cost_quality"),

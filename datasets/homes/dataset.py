@@ -86,6 +86,10 @@ class BuiltHome(BuiltScene):
 
     @cached_property
     def plan(self) -> HomePlan:
+        return self.furnished()
+
+    def furnished(self) -> HomePlan:
+        """The furnished home of this name, drawn again at each call."""
         return furnish(self._random("home"), catalogue(), training=self.series == "training")
 
     def make_mesh(self) -> SceneMesh:
@@ -98,14 +102,18 @@ class BuiltHome(BuiltScene):
         return SampledRenderer(self.mesh, width, height, like)
 
     def make_trajectory(self) -> Float64Array:
+        return self.walk("walk", self.options.n_frames)
+
+    def walk(self, name: str, n_frames: int) -> Float64Array:
+        """The poses (n_frames, 4, 4) of a walk through the home; walks of other names differ in speed and views."""
         plan, cell_m = self.plan, 0.05
         free, origin = plan.free(cell_m, PERSON_M)  # where people fit; all of it is connected
         carrier = self.options.carrier
         if carrier == "either":
             carrier = "robot" if self.number % 3 == 2 else "person"
         return walk_home(
-            self.unlit, free, cell_m, origin, plan.n_structure, self.options.n_frames,
-            self._random("walk"), carrier,
+            self.unlit, free, cell_m, origin, plan.n_structure, n_frames,
+            self._random(name), carrier,
         )  # fmt: skip
 
     def _random(self, what: str) -> np.random.Generator:

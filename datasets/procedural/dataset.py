@@ -115,6 +115,10 @@ class BuiltScene(ABC):
     def make_renderer(self, width: int, height: int, like: Renderer | None = None) -> Renderer:
         return Renderer(self.mesh, width, height, like)
 
+    def at(self, index: int) -> BuiltScene:
+        """The scene as frame ``index`` shows it."""
+        return self
+
     @cached_property
     def truth(self) -> SceneTruth:
         return truth_of(self.scene, self.kind, self.placed, self.mount, self.classes)
@@ -239,8 +243,9 @@ class GeneratedScenes(ABC):
     def render(self, scene: str, view: int | Float64Array) -> RenderedFrame:
         """The noise-free images at a frame of the trajectory or at any camera-to-world pose."""
         built = self.built(scene)
-        pose = built.trajectory[view] if isinstance(view, int | np.integer) else np.asarray(view, np.float64)
-        return built.renderer.render(pose)
+        if isinstance(view, int | np.integer):
+            return built.at(int(view)).renderer.render(built.trajectory[view])
+        return built.renderer.render(np.asarray(view, np.float64))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
         """Every ``stride``-th frame, rendered on first access."""
@@ -258,7 +263,7 @@ class GeneratedScenes(ABC):
         if width >= self.options.width:
             return self.frame(scene, index)
         built = self.built(scene)
-        renderer, pose = built.coarser(width), built.trajectory[index]
+        renderer, pose = built.at(index).coarser(width), built.trajectory[index]
         image = renderer.render(pose)
         intrinsics = camera_intrinsics(width, renderer.height)
         return Frame(index, index / FRAMES_PER_SECOND, image.rgb, image.depth_m, pose, intrinsics)

@@ -41,16 +41,20 @@ class SceneScan:
 
 
 def scan_scene(
-    patches: Patches, mesh: SceneMesh, poses: Float64Array, spacing_m: float, merged_m: float = 1e-4
-) -> SceneScan:
+    patches: Patches, mesh: SceneMesh, poses: Float64Array, spacing_m: float, merged_m: float = 1e-4,
+    earlier: tuple[SceneMesh, Float64Array] | None = None,
+) -> SceneScan:  # fmt: skip
     """The faces of about ``spacing_m`` that at least one of the poses sees.
 
+    ``earlier``: the mesh before a change and the poses until then, which also see what has not changed since.
     Vertices of an object in one cell of ``merged_m`` are merged: parts with finer faces do not have more vertices.
     """
     grid = cut(patches, spacing_m)
     points = at_rows(patches.corners, grid.rows)
     owner = patches.object_id[grid.quad_of_face]
     seen = _visible(points, grid, owner, mesh, poses)
+    if earlier is not None:
+        seen |= _visible(points, grid, owner, *earlier)
     faces = grid.faces[seen]
     return _welded(points, at_rows(patches.normals, grid.rows), faces, owner[seen], mesh, merged_m)
 

@@ -22,7 +22,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.tracked_points import LabelledPoints, PointCounts, count_points, labelled_points, point_values
 from su3d_bench.runs.executors import Report
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.job import Part, build_method
+from su3d_bench.runs.job import Part, SceneJob, build_method
 from su3d_bench.runs.scene_data import SceneData
 from su3d_bench.store.predictions import read_prediction
 
@@ -56,18 +56,9 @@ class _SceneCounts:
 def identities(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str], report: Report) -> list[Identity]:
     """Identity of each of ``methods`` under each of ``protocols`` of a run with intermediate maps.
 
-    Each map is compared with the ground truth that the frames until then have shown. Raises ``ConfigError`` for an
-    unknown name, and for a run without intermediate maps or instance protocols.
+    Each map is compared with the ground truth that the frames until then have shown. Raises as ``over_time``.
     """
-    methods = chosen_of(run, "method", methods, run.methods)
-    rules = [run.rules(name) for name in chosen_of(run, "protocol", protocols, tuple(run.protocols))]
-    rules = [one for one in rules if one.kind == "instance"]
-    if not rules:
-        raise ConfigError(f"{run.name}: identity needs an instance protocol, such as homes-instance")
-    jobs = jobs_of(run)
-    if not jobs or not jobs[0].config.anytime_text:
-        raise ConfigError(f"{run.name}: has no intermediate maps; run with --anytime-every N or --anytime SHARE...")
-    encoder = run.encoder(device_of(run))
+    methods, rules, jobs, encoder = over_time(run, methods, protocols)
     reasons = {part.name: reason for part in jobs[0].methods if (reason := _reason_against(part))}
     counts: dict[tuple[str, str], list[_SceneCounts]] = {(method, one.name): [] for method in methods for one in rules}
     for job in jobs:
@@ -84,6 +75,24 @@ def identities(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str
         Identity(method, protocol, None, 0, 0, reasons[method]) if method in reasons else _joined(method, protocol, own)
         for (method, protocol), own in counts.items()
     ]
+
+
+def over_time(
+    run: FinishedRun, methods: Sequence[str], protocols: Sequence[str]
+) -> tuple[Sequence[str], list[ProtocolRules], Sequence[SceneJob], Encoder]:
+    """The chosen methods and instance protocols of a run with intermediate maps, its jobs and its encoder.
+
+    Raises ``ConfigError`` for an unknown name, and for a run without intermediate maps or instance protocols.
+    """
+    methods = chosen_of(run, "method", methods, run.methods)
+    rules = [run.rules(name) for name in chosen_of(run, "protocol", protocols, tuple(run.protocols))]
+    rules = [one for one in rules if one.kind == "instance"]
+    if not rules:
+        raise ConfigError(f"{run.name}: has no instance protocol, such as homes-instance")
+    jobs = jobs_of(run)
+    if not jobs or not jobs[0].config.anytime_text:
+        raise ConfigError(f"{run.name}: has no intermediate maps; run with --anytime-every N or --anytime SHARE...")
+    return methods, rules, jobs, run.encoder(device_of(run))
 
 
 def _reason_against(part: Part) -> str | None:

@@ -28,6 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     _add_tables(actions)
     _add_timing(actions)
     _add_identity(actions)
+    _add_changes(actions)
     report_files.add_pages(actions)
     _add_instances(actions)
     _add_leaderboard(actions)
@@ -175,6 +176,26 @@ def call_identity(arguments: argparse.Namespace) -> None:
     with output.progress(len(run.scenes), is_quiet=arguments.quiet) as report:
         found = identities(run, arguments.methods, arguments.protocols, report)
     output.answer_tables(arguments, {"methods": list(map(asdict, found))}, [identity_table(found)])
+
+
+def _add_changes(verbs: Verbs) -> None:
+    parser = add_verb(verbs, "changes", call_changes, data=True)
+    parser.shared("run", "--methods", "--protocols", "--format")
+
+
+def call_changes(arguments: argparse.Namespace) -> None:
+    """Report how maps follow objects that move, vanish or appear: ghosts, times, Khronos' measures, t-AP.
+
+    su3d-bench run --scenes homes-changing/test0 --methods opensu3d --anytime-every 8 --out runs/changing
+    su3d-bench report changes runs/changing
+    """
+    from su3d_bench.analysis.changes import changes, changes_table
+    from su3d_bench.runs.verify import read_checked
+
+    run = read_checked(arguments.run)
+    with output.progress(len(run.scenes), is_quiet=arguments.quiet) as report:
+        found = changes(run, arguments.methods, arguments.protocols, report)
+    output.answer_tables(arguments, {"methods": list(map(asdict, found))}, [changes_table(found)])
 
 
 def _add_instances(verbs: Verbs) -> None:

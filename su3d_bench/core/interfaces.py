@@ -190,6 +190,13 @@ class IsAligned(Protocol):
 
 
 @runtime_checkable
+class HasChanges(DatasetAbility, Protocol):
+    """Its scenes change at a known frame; the ground truth is the scene at the end."""
+
+    def change(self, scene: str) -> types.SceneChange: ...
+
+
+@runtime_checkable
 class HasQueries(DatasetAbility, Protocol):
     """Queries with ``kind`` and ``answers``, the ids of all matching objects."""
 

@@ -25,6 +25,7 @@ from su3d_bench.core.system.files import user_folder
 DATASETS = {
     "homes": "su3d_bench.datasets.homes.dataset:Homes",
     "homes-sensor": "su3d_bench.datasets.homes.dataset:HomesSensor",
+    "homes-changing": "su3d_bench.datasets.homes.changing:HomesChanging",
     "rooms": "su3d_bench.datasets.rooms.dataset:Rooms",
     "replica": "su3d_bench.datasets.replica.dataset:Replica",
     "scannet": "su3d_bench.datasets.scannet.dataset:ScanNet",
@@ -46,7 +47,7 @@ METHODS = {
     "oracle": "su3d_bench.baselines.oracle:Oracle",
     "command": "su3d_bench.baselines.command.method:Command",
 }
-GENERATED = frozenset(("homes", "homes-sensor", "rooms"))  # rendered from their names, without files
+GENERATED = frozenset(("homes", "homes-changing", "homes-sensor", "rooms"))  # rendered from their names, without files
 CEILING_METHOD = "oracle"  # uses ground truth: its score is reported with every number, and is not a bound
 GROUND_TRUTH_FILES = "ground-truth"  # prefix of scenes with ground-truth files of an unknown dataset
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}

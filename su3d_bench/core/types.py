@@ -263,11 +263,25 @@ class GroundTruth:
 
 
 @dataclass(frozen=True)
+class SceneChange:
+    """A change of a scene: frames before ``first_frame`` show ``before``, the others what is there at the end.
+
+    ``left``: ids of objects that are no longer where they were; ``came``: of those at a new place; moved ones are both.
+    """
+
+    first_frame: int
+    before: GroundTruth
+    left: tuple[int, ...]
+    came: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class InstanceMesh:
     """The annotated surface, from which the runner projects perfect masks.
 
     ``vertices`` (V, 3) float32 m; ``triangles`` (T, 3) int32; ``instance_of_triangle`` (T,) int32, 0 for none;
-    ``class_of_instance`` maps an instance id to a class id of ``labels``.
+    ``class_of_instance`` maps an instance id to a class id of ``labels``. If the scene changes, frames before
+    ``first_frame`` show the mesh ``earlier``.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
@@ -282,6 +296,8 @@ class InstanceMesh:
     instance_of_triangle: Int32Array
     class_of_instance: Mapping[int, int]
     labels: LabelSet
+    earlier: InstanceMesh | None = None
+    first_frame: int = 0
 
     def __post_init__(self) -> None:
         check_fields(self, "instance mesh", DataError)

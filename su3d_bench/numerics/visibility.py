@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int32Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array
 
 # Above the random error of structured light at the end of its range, 4 cm at 5 m (Khoshelham and Elberink, Sensors
 # 2012), and below the thickness of most furniture, whose back must not count as seen from the front.
@@ -25,11 +25,19 @@ def visible(points: Float32Array, frame: Frame, distance_m: float = SEEN_M) -> B
     >>> visible(np.array([[0, 0, 2], [0, 0, 2.2], [0, 0, 1.8], [3, 0, 2]], np.float32), wall).tolist()
     [True, False, False, False]
     """
-    parts = [_visible(points[start : start + CHUNK], frame, distance_m) for start in range(0, len(points), CHUNK)]
-    return np.concatenate([np.zeros(0, np.bool_), *parts])
+    return np.asarray(np.abs(depth_gap(points, frame)) <= distance_m, np.bool_)
 
 
-def _visible(points: Float32Array, frame: Frame, distance_m: float) -> BoolArray:
+def depth_gap(points: Float32Array | Float64Array, frame: Frame) -> Float64Array:
+    """How far (N,) m behind each of ``points`` (N, 3) m, along the optical axis, a frame sees a surface.
+
+    Above 0 the frame looks through the point, below 0 the point is occluded; NaN outside the image or without depth.
+    """
+    parts = [_depth_gap(points[start : start + CHUNK], frame) for start in range(0, len(points), CHUNK)]
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _depth_gap(points: Float32Array | Float64Array, frame: Frame) -> Float64Array:
     height, width = frame.depth_m.shape
     to_world, camera = frame.camera_to_world, frame.intrinsics
     offset = points.T.astype(np.float64) - to_world[:3, 3:]
@@ -41,9 +49,9 @@ def _visible(points: Float32Array, frame: Frame, distance_m: float) -> BoolArray
     row = np.rint(camera[1, 1] * y / z + camera[1, 2])
     is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     depth_m = frame.depth_m[row[is_inside].astype(np.int64), column[is_inside].astype(np.int64)]
-    is_seen = np.zeros(len(points), np.bool_)
-    is_seen[rows[is_inside]] = (depth_m > 0) & (np.abs(z[is_inside] - depth_m) <= distance_m)
-    return is_seen
+    gap = np.full(len(points), np.nan)
+    gap[rows[is_inside]] = np.where(depth_m > 0, depth_m - z[is_inside], np.nan)
+    return gap
 
 
 def first_shown(clouds: Sequence[Float32Array], frames: Iterable[Frame]) -> list[Int32Array]:

@@ -101,6 +101,11 @@ class OpenSU3DConfig(BaseModel):
     dbscan_eps: Metres = 0.1
     dbscan_min_points: int = Field(default=20, ge=1)
     split_fraction: Fraction = 0.8
+    # Not in the paper, which never removes: an instance is removed if this many views in a row, of those that show its
+    # place, look through most of its points; 0 for never. 3: the sightings after which ORB-SLAM (Mur-Artal et al. 2015,
+    # section VI-B) keeps a new point. The margin is the default ``depth_tolerance`` of Khronos' ray verificator.
+    removal_views: int = Field(default=0, ge=0)
+    removal_margin_m: Metres = 0.1
     # The paper ranks views, not instances; the AP set-up it uses (OpenMask3D's) gives every mask confidence 1.
     # The other rules use the detector scores of an instance's views; top-m-sum is the sum of the best m over m.
     instance_score: InstanceScore = "ones"

@@ -17,6 +17,7 @@ from su3d_bench.core.files.state import check_range, read_state, write_state
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
+from su3d_bench.numerics.visibility import depth_gap
 from su3d_bench.opensu3d import tracking, voxel_map
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
@@ -43,9 +44,10 @@ class OpenSU3D:
         status="each step is tested on hand-worked cases; not compared with the original, and no number of its paper "
         "has been reproduced",
     )
-    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         **{scheme: {"scheme": scheme} for scheme in SCHEMES},
         "owner": {"border_pixel_rule": "owner"},
+        "removing": {"removal_views": 3},
         **{f"score-{rule}": {"instance_score": rule} for rule in ("mean", "max", "top-m-sum")},
     }
     # The paper's symbols, as varied in its ablation (Table I).
@@ -67,6 +69,7 @@ class OpenSU3D:
         self._table = tracking.TrackingTable(list)
         self._images: list[tracking.ImageRecord] = []
         self._seeds: dict[int, int] = {}
+        self._n_absent: dict[int, int] = {}  # views in a row that look through an instance
         self._next_id = NO_INSTANCE + 1
         self._n_detections = 0
         self._losses: Counter[str] = Counter()  # over all frames
@@ -100,6 +103,9 @@ class OpenSU3D:
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Fuse one image into the map; the cost depends on the view, not on the size of the map."""
         detections.check_of(frame)
+        if self.config.removal_views:
+            with timer.stage("remove"):
+                self._look_through(frame)
         with timer.stage("backproject"):
             cloud = frame_cloud(frame, detections.masks, self.config)
         with timer.stage("match"):
@@ -112,12 +118,32 @@ class OpenSU3D:
         self._losses.update(self.losses)
         self._n_detections += len(detections)
 
+    @property
+    def _removed(self) -> Int32Array:
+        """The scene ids of removed instances. Their points stay, so that others keep their index, but do not count."""
+        n = self.config.removal_views
+        return np.array([key for key, n_absent in self._n_absent.items() if n and n_absent >= n], np.int32)
+
+    def _look_through(self, frame: Frame) -> None:
+        """Count the views in a row in which more of an instance's points are looked through than seen.
+
+        Occluded points and those outside the image do not count; a removed instance stays so.
+        """
+        own = np.flatnonzero((self._map.ids != NO_INSTANCE) & np.isin(self._map.ids, self._removed, invert=True))
+        gap, ids, margin_m = depth_gap(self._map.points[own], frame), self._map.ids[own], self.config.removal_margin_m
+        chosen = gap > margin_m, np.abs(gap) <= margin_m
+        n_through, n_seen = (np.bincount(ids[some], minlength=self._next_id) for some in chosen)
+        for key in np.flatnonzero(n_through + n_seen).tolist():
+            self._n_absent[key] = self._n_absent.get(key, 0) + 1 if n_through[key] > n_seen[key] else 0
+
     def _track(self, cloud: FrameCloud, matched: Int64Array, detections: Detections) -> Int32Array:
         """Scene id of each detection, NO_INSTANCE for those without points; also added to Q."""
         scene_id_of = np.full(len(detections), NO_INSTANCE, np.int32)
         if cloud.n_inside == 0:
             return scene_id_of
-        overlaps = tracking.count_overlaps(cloud.owner[: cloud.n_inside], self._map.ids_of(matched))
+        there = self._map.ids_of(matched)
+        there[np.isin(there, self._removed)] = NO_INSTANCE
+        overlaps = tracking.count_overlaps(cloud.owner[: cloud.n_inside], there)
         wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
         # One axis at a time: numpy's minimum over rows of three is ten times slower.
         lower = np.array([axis.min() for axis in cloud.points.T]) - self.config.eps
@@ -156,7 +182,8 @@ class OpenSU3D:
     def finish(self) -> Instances:
         """The instances of the current map and its points without an instance."""
         start = time.perf_counter()
-        by_age = self._map.by_age
+        by_age, removed = self._map.by_age, self._removed
+        by_age = by_age[~np.isin(self._map.ids[by_age], removed)]
         points, ids = self._map.points[by_age], self._map.ids[by_age]
         segments = segments_of(points, ids, by_age, self._table, self._seeds, self._images, self.config)
         instances = to_instances(points, ids, segments, self._images, self.config)
@@ -166,7 +193,7 @@ class OpenSU3D:
     def save_state(self, folder: Path) -> None:
         """Store the map, Q and all detections."""
         tables = {key: [[view.position, view.detection] for view in views] for key, views in self._table.items()}
-        counts = {"next_id": self._next_id, "n_detections": self._n_detections}
+        counts = {"next_id": self._next_id, "n_detections": self._n_detections, "absent": self._n_absent}
         losses = {"losses": dict(self._losses), "last_losses": self.losses}
         images = [image.content() for image in self._images]
         write_state(
@@ -188,6 +215,7 @@ class OpenSU3D:
                     raise StoreError(f"saved state: segment {key} has a view that does not exist")
             self._table[int(key)] = [tracking.View(*view) for view in views]
         self._seeds = {int(key): int(place) for key, place in values["seeds"].items()}
+        self._n_absent = {int(key): int(n) for key, n in values["absent"].items()}
         check_range("seeds", np.array([*self._seeds.values()], np.int64), 0, len(self._map))
         self._losses.update(values["losses"])
         self.losses = dict(values["last_losses"])

@@ -250,15 +250,19 @@ class OracleSegmenter:
     def __init__(self, truth: InstanceMesh | ObjectBoxes, config: OracleConfig) -> None:
         self._truth = truth
         self._config = config
+        self._earlier: tuple[int, OracleSegmenter] | None = None
         self._projector: MeshProjector | BoxProjector
         if isinstance(truth, InstanceMesh):
             self._projector = MeshProjector(truth, config)
             digest = array_digest(truth.vertices, truth.triangles, truth.instance_of_triangle)
+            if truth.earlier is not None:
+                self._earlier = truth.first_frame, OracleSegmenter(truth.earlier, config)
+                digest = content_key(digest, self._earlier[1].digest, str(truth.first_frame))
         else:
             self._projector = BoxProjector(truth, config)
             digest = _digest_of_boxes(truth)
         names = [f"{key}={truth.class_of_instance[key]}" for key in sorted(truth.class_of_instance)]
-        self.digest = content_key(
+        self.digest: str = content_key(
             "oracle",
             config.model_dump_json(),
             package_digest(*CODE),
@@ -268,6 +272,8 @@ class OracleSegmenter:
         )
 
     def segment(self, frame: Frame) -> Regions:
+        if self._earlier is not None and frame.index < self._earlier[0]:
+            return self._earlier[1].segment(frame)
         instance = self._projector.instance_image(frame)
         ids, counts = np.unique(instance, return_counts=True)
         of_class = self._truth.class_of_instance

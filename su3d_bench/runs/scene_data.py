@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.core.maps import Proposals
-from su3d_bench.core.types import Float64Array, GroundTruth, InstanceMesh, Int32Array, ObjectBoxes
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, Int32Array, ObjectBoxes
 from su3d_bench.corruptions.apply import CorruptedFrames, SceneCorruption, parse_conditions
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.seen import clouds_of
@@ -130,16 +131,24 @@ class SceneData:
             for rules in map(load_protocol, self.job.protocols):
                 with suppress(GroundTruthMissing):
                     clouds[rules.ground_truth] = clouds_of(self.truth(rules.ground_truth))
-            clean = frames.clean if isinstance(frames, CorruptedFrames) else iter(frames)
-            places = iter(first_shown([cloud for each in clouds.values() for cloud in each], clean))
+            places = iter(first_shown([cloud for each in clouds.values() for cloud in each], self.clean_frames(part)))
             self._shown[key] = {variant: [next(places) for _ in each] for variant, each in clouds.items()}
         return self._shown[key], len(frames)
 
-    def maps_over_time(self, part: jobs.Part, variant: str) -> tuple[list[tuple[Path, int]], GroundTruth, Int32Array]:
-        """The intermediate maps and the last one of ``part``, each with the number of frames shown until then; the
-        ground truth; and for each of its points the place of the first frame that shows it."""
-        self.report_activity(part, "finding what the frames show")
-        shown, n = self.first_shown(part)
-        folder = RunFolder(self.job.folder).job(self.job.scene, part.name)
+    def clean_frames(self, part: jobs.Part) -> Iterable[Frame]:
+        """The frames that a method gets, as they were before any corruption."""
+        frames = self.frames(part)
+        return frames.clean if isinstance(frames, CorruptedFrames) else frames
+
+    def maps(self, part: jobs.Part) -> list[tuple[Path, int]]:
+        """The intermediate maps and the last one of ``part``, each with the number of frames shown until then."""
+        n, folder = len(self.frames(part)), RunFolder(self.job.folder).job(self.job.scene, part.name)
         maps = [(folder.anytime(point), n_shown) for point, n_shown in self.job.config.anytime_points(n).items()]
-        return [*maps, (folder.prediction, n)], self.truth(variant), shown[variant][0]
+        return [*maps, (folder.prediction, n)]
+
+    def maps_over_time(self, part: jobs.Part, variant: str) -> tuple[list[tuple[Path, int]], GroundTruth, Int32Array]:
+        """The maps of ``part``; the ground truth; and for each of its points the place of the first frame that shows
+        it."""
+        self.report_activity(part, "finding what the frames show")
+        shown, _ = self.first_shown(part)
+        return self.maps(part), self.truth(variant), shown[variant][0]

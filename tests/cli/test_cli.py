@@ -155,7 +155,7 @@ def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
         ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
         ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
         ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
-        ("run --scenes nothing", "no scene matches 'nothing'; known datasets: homes, homes-sensor, rooms"),
+        ("run --scenes nothing", "no scene matches 'nothing'; known datasets: homes, homes-sensor, homes-changing"),
         (f"{TYPED} --methods opensu3", "unknown method 'opensu3'; did you mean 'opensu3d'?"),
         (f"{TYPED} --methods {SCENES}/none.py:X", f"method '{SCENES}/none.py:X': no file {SCENES}/none.py"),
         (f"{TYPED} --profile orcale", "unknown profile 'orcale'; did you mean 'oracle'?"),
@@ -168,7 +168,7 @@ def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
         (f"{TYPED} --set collector.dorp=1", "--set collector.dorp: unknown key 'dorp'; did you mean 'drop'?"),
         (f"{TYPED} --config none.toml", "none.toml: cannot read the configuration: No such file or directory"),
         ("protocols shwo", "protocols: unknown command 'shwo'; did you mean 'show'? known: list, show, "),
-        ("report runs/demo", "report: unknown command 'runs/demo'; known: tables, timing, identity, html, "),
+        ("report runs/demo", "report: unknown command 'runs/demo'; known: tables, timing, identity, changes, html, "),
         ("report tables r --tables VI", "report tables: unknown --tables 'VI'; did you mean 'V'? known: I, "),
         (
             f"query text {PAINTED}/a x",

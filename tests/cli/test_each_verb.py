@@ -52,6 +52,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "report tables": ("out --format latex --out tables.tex", 0, "tables.tex"),
     "report timing": ("out --out timing", 0, "timing/timing.md"),
     "report identity": ("out", 2, "has no intermediate maps"),
+    "report changes": ("out", 2, "has no intermediate maps"),
     "report html": ("out --no-maps --out page.html", 0, "page.html"),
     "report instances": ("out --out samples.csv", 0, "predicted instances"),
     "report leaderboard": ("out --out board.md", 0, "board.md"),

@@ -7,7 +7,7 @@ import pytest
 
 from su3d_bench.core.types import Frame
 from su3d_bench.numerics import visibility
-from su3d_bench.numerics.visibility import first_shown, visible
+from su3d_bench.numerics.visibility import depth_gap, first_shown, visible
 
 CAMERA = np.array([[20.0, 0, 20], [0, 20.0, 20], [0, 0, 1]])
 SIZE = (41, 41)
@@ -72,3 +72,9 @@ def test_each_point_has_the_first_frame_that_shows_it() -> None:
     expected = [0 if from_front else 1 if from_back else 9 for from_front, from_back in POINTS.values()]
     assert np.minimum(cloud, 9).tolist() == expected
     assert back.tolist() == [1]
+
+
+def test_gap_is_the_distance_to_the_surface_behind_a_point() -> None:
+    points = np.array([[0, 0, 1.5], [0, 0, 2], [0, 0, 2.5], [9, 0, 2], [0, -0.045, 0.045]], np.float32)
+    gap = depth_gap(points, from_the_front())
+    np.testing.assert_allclose(gap, [0.5, 0, -0.5, np.nan, np.nan])

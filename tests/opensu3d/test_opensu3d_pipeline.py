@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -206,3 +207,42 @@ def test_ring_pixels_are_not_matched_and_go_to_owner_background_or_nowhere() -> 
         assert (owner[is_ring] == (0 if choice == "owner" else -1)).all()
     assert n_points["owner"] == n_points["background"] > 100
     assert n_points["drop"] == 0
+
+
+REMOVING = OpenSU3DConfig(border_px=1, border_reference_width=0, removal_views=3)
+
+
+def names_left(plates: Sequence[Mapping[int, Plate]], config: OpenSU3DConfig = REMOVING) -> tuple[str, ...]:
+    return tuple(sorted(run([look(each, i) for i, each in enumerate(plates)], config).finish().names))
+
+
+def test_instance_is_removed_after_three_views_in_a_row_through_its_place() -> None:
+    one = {1: TWINS[1]}
+    for n_gone, left in ((2, ("plate 1", "plate 2")), (3, ("plate 1",)), (4, ("plate 1",))):
+        assert names_left([TWINS, TWINS, *[one] * n_gone]) == left
+        assert names_left([TWINS, TWINS, *[one] * n_gone], CONFIG) == ("plate 1", "plate 2")
+    assert names_left([TWINS, one, one, TWINS, one, one]) == ("plate 1", "plate 2"), "not in a row"
+    back = names_left([TWINS, one, one, one, TWINS])
+    assert back == ("plate 1", "plate 2"), "what comes back is a new instance"
+
+
+def test_occluded_or_unseen_or_nearly_seen_instance_is_kept() -> None:
+    one, near = {1: TWINS[1]}, Plate((0.1, 0.6), (-0.3, 0.3), 2.09)
+    hidden = {1: TWINS[1], 3: Plate((0.0, 0.7), (-0.5, 0.5), 1.0)}
+    assert "plate 2" in names_left([TWINS, *[hidden] * 4])
+    views = [look(TWINS, 0), *(look(one, i, -3.0) for i in range(1, 5))]
+    assert "plate 2" in run(views, REMOVING).finish().names
+    assert "plate 2" in names_left([TWINS, *[{1: TWINS[1], 2: near}] * 4]), "9 cm behind: within the margin"
+
+
+def test_removal_continues_from_a_saved_state(tmp_path: Path) -> None:
+    views = [look(each, i) for i, each in enumerate([TWINS, *[{1: TWINS[1]}] * 4])]
+    for n in (3, 4):  # before and after the removal
+        again = OpenSU3D(REMOVING)
+        (tmp_path / str(n)).mkdir()
+        run(views[:n], REMOVING).save_state(tmp_path / str(n))
+        again.load_state(tmp_path / str(n))
+        for view in views[n:]:
+            again.update(*view, Timer())
+        assert contents(again.finish()) == contents(run(views, REMOVING).finish())
+        assert again.finish().names == ("plate 1",)

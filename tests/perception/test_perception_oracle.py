@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,13 @@ def test_oracle_method_returns_all_ground_truth_instances() -> None:
     assert np.allclose(found.boxes[0], [points[[1, 4]].min(axis=0), points[[1, 4]].max(axis=0)])
     assert np.allclose(found.centroids[1], points[[0, 3]].mean(axis=0))
     assert np.array_equal(found.points, points)
+
+
+def test_frames_before_a_change_show_the_earlier_mesh() -> None:
+    """The square appears at frame 5: until then the wall behind it has no hole."""
+    last, earlier = quad_mesh(SQUARE, WALL, instance=[1, 2]), quad_mesh(WALL, instance=[2])
+    segmenter = OracleSegmenter(replace(last, earlier=earlier, first_frame=5), OracleConfig(fill_px=0))
+    assert segmenter.segment(flat_frame(index=4)).masks.sum() == 120 * 160
+    assert segmenter.segment(flat_frame(index=5)).masks.sum() == 120 * 160 - 30 * 40
+    assert segmenter.segment(square_frame(index=5)).names == ("chair", "cup")
+    assert segmenter.digest != OracleSegmenter(last, OracleConfig(fill_px=0)).digest
