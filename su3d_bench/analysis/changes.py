@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +13,16 @@ from su3d_bench.analysis.identity import over_time
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import HasChanges, UsesGroundTruth
 from su3d_bench.core.maps import DenseFeatures, Instances
-from su3d_bench.core.types import Float32Array, Frame, GroundTruth, SceneChange
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, GroundTruth, Int64Array, SceneChange
 from su3d_bench.formats.tables.table import NOT_MEASURED, Table, percent, text_table
 from su3d_bench.metrics import changes as metric
-from su3d_bench.metrics.changes import NEVER, Pairs, Places
+from su3d_bench.metrics.changes import NEVER, MapAt, Pairs, Places
 from su3d_bench.metrics.instance.average_precision import InstanceCounts, combine
 from su3d_bench.metrics.instance.score import masks_and_scores
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.matching.transfer import masks_of_partition, reduce_to_voxels, transfer_masks
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.questions.score import first_instances
 from su3d_bench.numerics.visibility import SEEN_M, depth_gap, visible
 from su3d_bench.runs.executors import Report
 from su3d_bench.runs.finished import FinishedRun
@@ -29,7 +31,7 @@ from su3d_bench.runs.scene_data import SceneData
 from su3d_bench.store.predictions import read_prediction
 
 COLUMNS = ("ghosts", "ghost points", "found", "removed", "wrong merges", "ObjectF1", "4D ObjectF1", "AppearedF1",
-           "DisappearedF1", "ChangeF1", "t-AP", "t-AP50")  # fmt: skip
+           "DisappearedF1", "ChangeF1", "t-AP", "t-AP50", "where then", "where now")  # fmt: skip
 WAITS = ("updates until found", "updates until removed")
 SPACING_M, MIN_POINTS = 0.03, 25  # of points that count, and of a seen object: 100 vertices of a scan at 1.5 cm
 
@@ -43,7 +45,7 @@ class Changes:
     values: Mapping[str, float | None]
 
 
-_Known = tuple[Places, Float32Array]  # the places and points of a scene
+_Known = tuple[Places, Float32Array, Sequence[str]]  # the places, points and names of a scene
 _Counts = tuple[Pairs, InstanceCounts | None]  # of a scene; the second is that of t-AP
 
 
@@ -67,7 +69,7 @@ def changes(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str], 
                 key = len(scene.frames(fed)), fed.corruption  # the oracle's, which uses none, are those of another
                 if key not in known:
                     known[key] = places_of(change, scene.truth(one.ground_truth), one, scene.clean_frames(fed))
-                counts[part.name, one.name].append(_count(known[key], part, one, scene.maps(fed)))
+                counts[part.name, one.name].append(_count(run, known[key], part, one, scene.maps(fed)))
     thresholds = {one.name: one.thresholds for one in rules}
     return [Changes(*names, _values(each, thresholds[names[1]])) for names, each in counts.items()]
 
@@ -106,12 +108,43 @@ def places_of(change: SceneChange, truth: GroundTruth, rules: ProtocolRules, fra
         is_gone = np.append(is_left, False)[place] & (frame.index >= change.first_frame)
         gone = np.flatnonzero((places.empty == NEVER) & is_gone)
         places.empty[gone[depth_gap(points[gone], frame) > SEEN_M]] = n
-    return places, points
+    return places, points, _names(change, truth, rules, ids)
 
 
-def _count(known: _Known, part: Part, rules: ProtocolRules, files: Sequence[tuple[Path, int]]) -> _Counts:
+def _names(change: SceneChange, truth: GroundTruth, rules: ProtocolRules, ids: Int64Array) -> list[str]:
+    """The class name of each of the objects ``ids``, empty if another object of the class is there before or after."""
+    instance = np.concatenate([change.before.instance, truth.instance]).astype(np.int64)
+    semantic = np.concatenate([change.before.semantic, truth.semantic])
+    objects = np.unique(instance[instance > 0] << 32 | semantic[instance > 0])
+    class_of = dict(zip((objects >> 32).tolist(), (objects & 0xFFFFFFFF).tolist(), strict=True))
+    n_objects = Counter(class_of.values())
+    name_of = {entry.id: rules.prompt_names.get(entry.name, entry.name) for entry in rules.scored}
+    return [name_of[class_of[one]] if n_objects[class_of[one]] == 1 else "" for one in ids.tolist()]
+
+
+def _answers(
+    run: FinishedRun, known: _Known, found: MapAt, is_asked: BoolArray, rules: ProtocolRules, path: Path | None
+) -> Int64Array:
+    """Right answers of the map in ``path`` to "where is the NAME?", and questions (2,): about those of the places
+    ``is_asked`` whose object has been seen and is the only one of its name; without ``path``, the oracle's answers."""
+    places, _, names = known
+    asked = np.flatnonzero(is_asked & (places.after[0] <= found.n_updates) & (np.array(names) != ""))
+    if path is None:
+        first = np.array([np.flatnonzero(found.ids == places.object_ids[row])[0] for row in asked], np.int64)
+        return metric.answers(found, asked, first)
+    prediction = read_prediction(path)
+    assert not isinstance(prediction, DenseFeatures)
+    if prediction.features is None:
+        return np.zeros(2, np.int64)
+    texts = [names[row] for row in asked.tolist()]
+    return metric.answers(found, asked, first_instances(rules, texts, prediction, run.encoder()))
+
+
+def _count(
+    run: FinishedRun, known: _Known, part: Part, rules: ProtocolRules, files: Sequence[tuple[Path, int]]
+) -> _Counts:
     """The counts of a method's maps in ``files``, each after so many updates; the oracle has what is there and seen."""
-    (places, points), is_oracle = known, isinstance(build_method(part), UsesGroundTruth)
+    (places, points, _), is_oracle = known, isinstance(build_method(part), UsesGroundTruth)
     maps = [places.perfect(n_updates) for _, n_updates in files if is_oracle]
     for path, n_updates in () if is_oracle else files:
         prediction = read_prediction(path)
@@ -122,7 +155,11 @@ def _count(known: _Known, part: Part, rules: ProtocolRules, files: Sequence[tupl
         moved = transfer_masks(prediction.points, masks, points, cap_m, voxel_m)
         ids = prediction.ids if isinstance(prediction, Instances) and len(prediction.ids) else np.arange(len(masks))
         maps.append(places.map_at(n_updates, moved, np.asarray(ids, np.int64), scores))
-    pairs, before = metric.count_changes(places, maps), metric.last_before_change(places, maps)
+    pairs, before = dict(metric.count_changes(places, maps)), metric.last_before_change(places, maps)
+    path_of = {} if is_oracle else {n_updates: path for path, n_updates in files}
+    for name, one, is_asked in (("then", before, places.is_left), ("now", maps[-1], places.is_new)):
+        if one is not None:
+            pairs[f"where {name}"] = _answers(run, known, one, is_asked, rules, path_of.get(one.n_updates))
     if before is None or not getattr(build_method(part), "keeps_ids", False):
         return pairs, None
     return pairs, metric.count_stages(places, [before, maps[-1]], rules.thresholds)

@@ -193,6 +193,16 @@ def wrong_merges(places: Places, found: MapAt) -> Int64Array:
     return np.array([(covers.sum(axis=0) > 1).sum(), np.count_nonzero(found.n_points)], np.int64)
 
 
+def answers(found: MapAt, asked: Int64Array, first: Int64Array) -> Int64Array:
+    """Right answers to "where is it?", and questions (2,).
+
+    The answer to a question about place ``asked`` (Q,) is the instance ``first`` (Q,), -1 for none; it is right if
+    the instance has more points there than at any other place or on background.
+    """
+    main = np.append(np.concatenate([found.n_background[None], found.seen]).argmax(axis=0) - 1, -2)
+    return np.array([np.count_nonzero(main[first] == asked), len(asked)], np.int64)
+
+
 def iou(found: MapAt) -> Float64Array:
     """The IoU (R, K) of each place and instance on the points seen."""
     return np.asarray(found.seen / np.maximum(found.n_seen[:, None] + found.n_points - found.seen, 1), np.float64)

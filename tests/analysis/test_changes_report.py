@@ -62,6 +62,7 @@ def test_map_that_never_removes_keeps_a_ghost_and_the_oracle_none(
     assert (found["ObjectPrecision"], found["ObjectRecall"]) == ((3 * 3 + 3 * 2) / (6 * 3), 1)
     assert found["DisappearedRecall"] == 0
     assert "t-AP" not in found, "its ids do not persist"
+    assert (perfect["where then"], found["where now"], perfect["where now"]) == (1, None, None)
     assert (perfect["ghosts"], perfect["removed"], perfect["updates until removed"]) == (0, 1, 0)
     assert [perfect[name] for name in ("ObjectF1", "DisappearedF1", "ChangeF1", "t-AP")] == [1, 1, 1, 1]
 

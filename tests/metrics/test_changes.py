@@ -53,6 +53,14 @@ def test_map_that_never_removes_has_the_hand_worked_ghost_rate() -> None:
     assert changes.ghosts(hoarder(2)).tolist() == [0, 3, 0, 30]
 
 
+def test_answer_to_where_is_right_if_the_instance_is_mostly_there() -> None:
+    """The map has the moved object at its new place, the vanished one as a ghost, and an instance of background."""
+    last = at(6, {2: points(NEW_2) + points(OF_1)[:3], 3: points(OF_3), 9: points(-1) + points(OF_4)[:9]})
+    asked = np.array([NEW_2, NEW_2, OLD_2, OF_4, OF_3, OF_3])
+    assert changes.answers(last, asked, np.array([0, 1, 0, 2, 1, -1])).tolist() == [2, 6]
+    assert changes.answers(at(6, {}), np.array([NEW_2]), np.array([-1])).tolist() == [0, 1]
+
+
 def test_true_instances_have_no_ghosts_and_f1_1() -> None:
     maps = [perfect(n) for n in range(1, 7)]
     found = values(maps)
