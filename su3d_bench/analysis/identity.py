@@ -88,7 +88,7 @@ def over_time(
     rules = [run.rules(name) for name in chosen_of(run, "protocol", protocols, tuple(run.protocols))]
     rules = [one for one in rules if one.kind == "instance"]
     if not rules:
-        raise ConfigError(f"{run.name}: has no instance protocol, such as homes-instance")
+        raise ConfigError(f"{run.name}: has no instance protocol; run it with --extend --protocols homes-instance")
     jobs = jobs_of(run)
     if not jobs or not jobs[0].config.anytime_text:
         raise ConfigError(f"{run.name}: has no intermediate maps; run with --anytime-every N or --anytime SHARE...")
