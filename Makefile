@@ -4,7 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile -c constraints.txt
 DEMO_SCENES := homes/tuning0 homes/tuning1 homes/tuning2 homes/tuning3
-BENCH_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
 .PHONY: demo test test-quick proofs mutants bench bench-methods reference architecture docs lint clean
 
@@ -41,16 +40,14 @@ bench: $(VENV)/test
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks write_performance build/bench.json
 
-# All methods on four rooms, and on corridors long enough for maps of 5 million points: on two cores three
-# quarters of an hour for the rooms and half an hour for the corridors.
+# All methods on corridors long enough for maps of 5 million points: half an hour on two cores.
 CORRIDOR_RUN := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --jobs 1
 CORRIDOR := benchmarks/scale/corridor.py:Corridor
 bench-methods: $(VENV)/test
-	$(BIN)/su3d-bench run --scenes $(BENCH_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/930m --methods opensu3d conceptfusion conceptfusion-sam sam3d@incremental conceptgraphs --out runs/bench-corridor
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/310m --methods conceptgraphs-detector --out runs/bench-corridor-detector
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/10m $(CORRIDOR)/30m $(CORRIDOR)/100m $(CORRIDOR)/300m $(CORRIDOR)/1000m --limit 20 --set corridor.step_m=0.5 --methods openmask3d openmask3d-segment3d --out runs/bench-corridor-scans
-	$(BIN)/python benchmarks write_performance build/bench.json --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
+	$(BIN)/python benchmarks write_performance build/bench.json --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
 
 # Creates the reference for the regression check in .ci/run; commit it with the change that affects results. The limits
 # are wide because CI machines and their load vary.

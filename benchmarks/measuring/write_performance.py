@@ -1,6 +1,6 @@
 """Write ``docs/running/performance.md`` (results) and ``benchmarks/measured.md`` (all measured tables).
 
-``python benchmarks write_performance [build/bench.json] [--rooms RUN] [--corridors RUN]``: the JSON file comes from
+``python benchmarks write_performance [build/bench.json] [--corridors RUN]``: the JSON file comes from
 ``make bench``, the runs from ``make bench-methods``. Parts without new input are kept, including
 the hand-written list of targets and tables of scripts that left no new file.
 """
@@ -46,7 +46,6 @@ NOTES_HEAD = f"""# What was measured
 """
 TARGETS_TITLE = "## Targets"
 MISSED_TITLE = "## Missed targets"
-ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
 `make bench-methods`: corridors of the given lengths, perfect masks, one update per frame. OpenMask3D's map is the
@@ -121,28 +120,6 @@ def program_of(section: str) -> str | None:
     return found[1] if found else None
 
 
-def rooms_section(run: Path) -> str:
-    """Run time and memory of every method on a run's scenes."""
-    rows = [["method", "updates", "ms per update", "map update", "finish, s", "whole scene, s", "peak memory, MiB"]]
-    for times in _times(run):
-        summary = summarise(times)
-        total_s = [one.ms(TOTAL).sum() / 1e3 + one.maps[-1].finish_ms / 1e3 for one in times]
-        rows.append(
-            [
-                summary.method,
-                str(summary.n_updates),
-                *(f"{_stage(summary, name).p50:.0f}" for name in (TOTAL, MAP)),
-                f"{(summary.finish_ms or 0) / 1e3:.1f}",
-                f"{sum(total_s) / len(total_s):.0f}",
-                f"{(summary.peak_rss_bytes or 0) / 2**20:.0f}",
-            ]
-        )
-    scenes = ", ".join(read_run(run).scenes)
-    text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes at a time. "
-    text += "Medians over updates (map update: without reading and perception), slowest `finish`, process memory."
-    return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
-
-
 def corridors_section(runs: Sequence[Path]) -> str:
     """Growth of each method's update cost with its map, and the plot."""
     every = [times for run in runs for times in _times(run)]
@@ -215,13 +192,12 @@ def head_of(page: str) -> str:
     return f"{page.partition(chr(10) + '## ')[0].rstrip()}\n"
 
 
-def results_page(before: str, hardware: str | None, rooms: Path | None, corridors: Sequence[Path] | None) -> str:
+def results_page(before: str, hardware: str | None, corridors: Sequence[Path] | None) -> str:
     """The page of results; None keeps the text of ``before``."""
     sections = [
         head_of(before) if hardware is None else PAGE_HEAD.format(hardware=hardware),
         section_of(before, TARGETS_TITLE),
         section_of(before, MISSED_TITLE),
-        section_of(before, ROOMS_TITLE) if rooms is None else rooms_section(rooms),
         section_of(before, CORRIDORS_TITLE) if corridors is None else corridors_section(corridors),
     ]
     return "\n".join(filter(None, sections))
@@ -244,7 +220,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("benchmarks", type=Path, nargs="?", help="JSON file of pytest-benchmark")
     parser.add_argument("--measured", type=Path, default=Path("build/measured"), help="folder of scripts' JSON files")
-    parser.add_argument("--rooms", type=Path, metavar="RUN")
     parser.add_argument("--corridors", type=Path, nargs="+", metavar="RUN")
     asked = parser.parse_args()
     hardware, groups = None, None
@@ -254,7 +229,7 @@ def main() -> None:
     page, notes = (file.read_text(encoding="utf-8") for file in (PAGE, NOTES))
     measured = list(measured_sections(asked.measured))
     NOTES.write_text(notes_page(notes, hardware, groups, measured), encoding="utf-8")
-    PAGE.write_text(results_page(page, hardware, asked.rooms, asked.corridors), encoding="utf-8")
+    PAGE.write_text(results_page(page, hardware, asked.corridors), encoding="utf-8")
 
 
 if __name__ == "__main__":
