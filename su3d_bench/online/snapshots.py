@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import signal
@@ -68,6 +69,8 @@ class PendingSnapshot:
             write_prediction(self._map, method.finish())  # the map itself may have views of what updates change
             self.as_of = as_of_map(method, as_of)
             return
+        with suppress(OSError, AttributeError):  # glibc only
+            ctypes.CDLL(None).malloc_trim(0)  # memory that is free need not be copied when updates use it again
         with warnings.catch_warnings():  # Python 3.12 warns if there are other threads; ``finish`` needs none of them
             warnings.simplefilter("ignore", DeprecationWarning)
             self._process = os.fork()
