@@ -24,7 +24,7 @@ from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Stor
 from su3d_bench.core.types import Frame, SceneInfo
 from su3d_bench.store.predictions import prediction_arrays
 
-MORE_HOMES = ("homes/seed1", "homes/test0", "homes/tuning8")
+MORE_HOMES = ("homes/seed1", "homes/test0", "homes/seed2")
 SCENES = ("rooms/bathroom7", "homes/seed0", *(pytest.param(one, marks=pytest.mark.proof) for one in MORE_HOMES))
 N_FRAMES = 8
 IN_MEMORY = 'conceptfusion@feature_storage="memory"'
