@@ -73,11 +73,11 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
 class BuiltHome(BuiltScene):
     """A furnished home."""
 
-    scan_stride = 8  # between these frames the camera moves by centimetres
-
     def __init__(self, scene: str, options: HomeOptions, folder: Path | None) -> None:
         super().__init__(scene, options, folder)
         self.series, self.number = scene_name_parts(scene)
+        # Of 1600 frames every eighth: between these the camera moves by centimetres.
+        self.scan_stride = max(1, min(8, options.n_frames // 200))
         self.merged_m = 0.8 * options.mesh_spacing_m  # a grid of that spacing keeps its vertices, finer parts do not
 
     @property
