@@ -6,7 +6,7 @@ import shutil
 import stat
 import struct
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,14 +35,14 @@ class SceneProgram:
         self._numbers: list[int] = []
         self._n_folders = 0
 
-    def greet(self) -> None:
+    def start(self) -> None:
         """Describe the scene to the program."""
         lines = [f"{name} {printable(str(value))}" for name, value in self._values.items()]
         has_mesh = (self._folders["frames"] / "mesh.ply").is_file()
         lines += [f"version {pipes.VERSION}", f"mesh {self._places['frames'] + '/mesh.ply' if has_mesh else ''}"]
         version = self.piped.ask(pipes.HELLO, "start", "\n".join(lines).encode())
         if version != str(pipes.VERSION):
-            raise PredictionError(f"start: the program speaks version '{version}' of the messages, not {pipes.VERSION}")
+            raise PredictionError(f"start: the program uses version '{version}' of the messages, not {pipes.VERSION}")
 
     def send(self, frame: Frame) -> None:
         """Give the program a frame."""
@@ -73,8 +73,10 @@ class SceneProgram:
                 name = printable(file.name, 80)
                 raise PredictionError(f"save: '{name}' cannot be stored; write plain files, not named as {OWN_FILES}")
             shutil.copyfile(file, folder / file.name, follow_symlinks=False)
-        mesh = {} if surface is None else {"vertices": surface.vertices, "triangles": surface.triangles}
-        write_state(folder, {"scene": self._values, "numbers": self._numbers, **mesh})
+        values = {"scene": self._values, "numbers": self._numbers}
+        if surface is not None:
+            values |= {"vertices": surface.vertices, "triangles": surface.triangles}
+        write_state(folder, values)
 
     def load(self, folder: Path, numbers: list[int]) -> None:
         """Give the program the state that it wrote to ``folder`` after these frames."""
@@ -100,6 +102,8 @@ class SceneProgram:
 def saved_scene(folder: Path) -> tuple[SceneInfo, list[int]]:
     """The scene of a saved state, and the frames that it has; raises what ``read_state`` raises."""
     values = read_state(folder, FORMS)
-    surface = Surface(values["vertices"], values["triangles"]) if "vertices" in values else None
-    scene = SceneInfo(**values["scene"], read_surface=None if surface is None else lambda: surface)
+    scene = SceneInfo(**values["scene"])
+    if "vertices" in values:
+        surface = Surface(values["vertices"], values["triangles"])
+        scene = replace(scene, read_surface=lambda: surface)
     return scene, [int(number) for number in values["numbers"]]

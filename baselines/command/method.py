@@ -121,7 +121,7 @@ class Command:
         self._frames: FrameFolder | None = None
         self._surface: Surface | None = None
         self._scratch: TemporaryFolder | None = None
-        self._live: SceneProgram | None = None  # the running program of ``frame_by_frame``
+        self._program: SceneProgram | None = None  # the running program of ``frame_by_frame``
         self.as_of: int | None = None
         # Costs of the program until its last map: ``program_s`` and, if measured, ``program_peak_bytes``.
         self.finish_costs: dict[str, float | int] = {}
@@ -160,9 +160,9 @@ class Command:
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Gives the frame to the running program, or adds it to the folder that the program gets with ``finish``."""
         assert self._frames is not None, "update before start"
-        if self._live is not None:
+        if self._program is not None:
             with timer.stage("program"), self._errors():
-                self._live.send(frame)
+                self._program.send(frame)
             return
         with timer.stage("export"):
             self._frames.add(frame)
@@ -170,16 +170,15 @@ class Command:
     def finish(self) -> Prediction:
         """The program's map of the frames so far."""
         assert self._frames is not None and self._scene is not None, "finish before start"
-        if self._live is None:
-            self._frames.close()
         with self._errors():
-            if self._live is None:
+            if self._program is None:
+                self._frames.close()
                 output = self._run()
             else:
-                output, self.as_of = self._live.current_map()
-                watch = self._live.piped.program.watch
+                output, self.as_of = self._program.current_map()
+                watch = self._program.piped.program.watch
                 watch.look()
-                self._set_costs(self._live.piped.waited_s, watch.peak_bytes)
+                self._set_costs(self._program.piped.waited_s, watch.peak_bytes)
             prediction = read_output(output, self._scene.scene, self.config.format)
             for remark in prediction.remarks:
                 logger.warning("%s", printable(remark))
@@ -189,26 +188,27 @@ class Command:
     def revise(self, poses: Mapping[int, Float64Array]) -> None:
         """Moves frames, if the program can; ``ConfigError`` if it refuses."""
         with self._errors():
-            self._running("be revised").revise(poses)
+            self._running_program("be revised").revise(poses)
 
     def save_state(self, folder: Path) -> None:
         """Stores the program's state; ``ConfigError`` if it refuses."""
         with self._errors():
-            self._running("be saved").save(folder, self._surface)
+            self._running_program("be saved").save(folder, self._surface)
 
     def load_state(self, folder: Path) -> None:
         """Starts the program with a saved state."""
         scene, numbers = saved_scene(folder)
         self.start(scene)
         with self._errors():
-            self._running("be loaded").load(folder, numbers)
+            self._running_program("be loaded").load(folder, numbers)
 
     def close(self) -> None:
         """End a running program and remove its folders."""
-        live, self._live = self._live, None
+        program, self._program = self._program, None
         try:
-            if live is not None:
-                self._log(live.piped.end(in_order=sys.exc_info()[0] is None))  # not if the run fails or is interrupted
+            if program is not None:
+                has_failed = sys.exc_info()[0] is not None  # the run, or it was interrupted
+                self._log(program.piped.end(in_order=not has_failed))
         finally:
             if self._scratch is not None:
                 self._scratch.close()
@@ -218,10 +218,10 @@ class Command:
         if getattr(self, "_scratch", None) is not None:
             self.close()
 
-    def _running(self, what: str) -> SceneProgram:
-        if self._live is None:
+    def _running_program(self, what: str) -> SceneProgram:
+        if self._program is None:
             raise ConfigError(f"method 'command': cannot {what} unless frame_by_frame = true")
-        return self._live
+        return self._program
 
     @property
     def _folders(self) -> dict[str, Path]:
@@ -246,10 +246,10 @@ class Command:
         for folder in self._folders.values():
             folder.mkdir(exist_ok=True)
         with self._errors():
-            words, places, how = self._command()
-            program = PipedProgram(self._folders[PIPES], self.config.timeout_s, words, **how)
-            self._live = SceneProgram(program, self._scene, self._folders, places)
-            self._live.greet()
+            words, places, options = self._command()
+            program = PipedProgram(self._folders[PIPES], self.config.timeout_s, words, **options)
+            self._program = SceneProgram(program, self._scene, self._folders, places)
+            self._program.start()
 
     def _run(self) -> Path:
         """The folder with the program's output."""
@@ -257,8 +257,8 @@ class Command:
         for name in ("output", "work"):
             shutil.rmtree(folders[name], ignore_errors=True)
             folders[name].mkdir()
-        words, _, how = self._command()
-        done = run_program(words, timeout_s=self.config.timeout_s, **how)
+        words, _, options = self._command()
+        done = run_program(words, timeout_s=self.config.timeout_s, **options)
         self._set_costs(done.wall_s, done.peak_memory_bytes)
         self._log(done)
         if done.is_timed_out:
@@ -283,15 +283,11 @@ class Command:
             words = ["conda", "run", "--no-capture-output", kind, self.config.environment, *words]
         environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ} | variables
         logger.info("program: %s", printable(shlex.join(words)))
-        how = {
-            "folder": folders["work"],
-            "environment": environment,
-            "id_file": None if container is None else id_file,
+        options = {"folder": folders["work"], "environment": environment, "scratch": folders["frames"].parent}
+        if container is not None:
             # `docker run` may end before its container does: ending the client is not enough.
-            "afterwards": () if container is None else ("docker", "kill", container),
-            "scratch": folders["frames"].parent,
-        }
-        return words, places, how
+            options |= {"id_file": id_file, "afterwards": ("docker", "kill", container)}
+        return words, places, options
 
     def _values(self, folders: Mapping[str, str]) -> dict[str, str]:
         assert self._scene is not None
@@ -326,8 +322,9 @@ class Command:
         return [*words, self.config.image]
 
     def _set_costs(self, program_s: float, peak_bytes: int | None) -> None:
-        peak = {} if peak_bytes is None else {"program_peak_bytes": peak_bytes}
-        self.finish_costs = {"program_s": round(program_s, 3), **peak}
+        self.finish_costs = {"program_s": round(program_s, 3)}
+        if peak_bytes is not None:
+            self.finish_costs["program_peak_bytes"] = peak_bytes
 
     def _log(self, done: Finished) -> None:
         n_bytes = done.peak_memory_bytes

@@ -27,20 +27,20 @@ ANSWERS = OK, REFUSED, ERROR = range(100, 103)
 MAY_REFUSE = (REVISE, SAVE, LOAD)
 MAX_ANSWER_BYTES = 4096
 FINISH_S = 30.0  # for the answer to the last request, when all maps have been read
-LAST_WORDS_S = 1.0  # for a program that fails to end by itself
+EXIT_WAIT_S = 1.0  # for a program that fails to end by itself
 
 
-class _BrokenError(Exception):
+class _ProtocolError(Exception):
     """Why there is no valid answer; without a text, the program ended or closed a pipe."""
 
 
 class PipedProgram:
-    """A program that answers one request after another, each within ``timeout_s``; ``how``: arguments of ``Program``.
+    """A program that answers one request after another, each within ``timeout_s``.
 
-    ``waited_s``: the time of all requests until now.
+    ``options``: arguments of ``Program``; ``waited_s``: the time of all requests until now.
     """
 
-    def __init__(self, pipes: Path, timeout_s: float, words: Sequence[str], **how: Any) -> None:
+    def __init__(self, pipes: Path, timeout_s: float, words: Sequence[str], **options: Any) -> None:
         self._timeout_s, self._fault, self._n_asked, self.waited_s = timeout_s, "", 0, 0.0
         self._finished: Finished | None = None
         self._ends: list[IO[bytes]] = []
@@ -48,13 +48,13 @@ class PipedProgram:
             os.mkfifo(pipes / name)
             for mode, flag in (("rb", os.O_RDONLY), ("wb", os.O_WRONLY)):
                 self._ends.append(os.fdopen(os.open(pipes / name, flag | os.O_NONBLOCK), mode, 0))
-        self.program = Program(words, **how)
+        self.program = Program(words, **options)
 
     def ask(self, kind: int, what: str, *content: bytes | memoryview) -> str:
         """The text of the program's answer to a request; ``what`` names it in messages.
 
         Raises ``ConfigError`` if the program refuses what it may refuse, and ``PredictionError`` if it fails, ends,
-        breaks the rules or needs too long; it is ended then, and every further request raises the same error.
+        violates the protocol or needs too long; it is ended then, and every further request raises the same error.
         """
         if self._fault:
             raise PredictionError(self._fault)
@@ -66,7 +66,7 @@ class PipedProgram:
             for part in (memoryview(header), *parts):
                 self._send(part, until)
             answer, text = self._receive_answer(until)
-        except _BrokenError as error:
+        except _ProtocolError as error:
             self._fail(what, str(error))
         finally:
             self.waited_s += time.perf_counter() - start
@@ -94,7 +94,7 @@ class PipedProgram:
         return self._finished
 
     def _fail(self, what: str, why: str) -> NoReturn:
-        has_ended = self.program.ends_within(LAST_WORDS_S)
+        has_ended = self.program.ends_within(EXIT_WAIT_S)
         done = self.end()
         why = why or f"{done.ending if has_ended else 'it closed its pipe'} before its answer"
         self._fault = f"{what}: {why}{done.last_line}"
@@ -111,11 +111,11 @@ class PipedProgram:
     def _receive_answer(self, until: float) -> tuple[int, str]:
         magic, kind, number, n_bytes = HEADER.unpack(self._receive(HEADER.size, until))
         if magic != MAGIC or kind not in ANSWERS:
-            raise _BrokenError(f"its answer begins with {magic!r} and kind {kind}, which is no answer")
+            raise _ProtocolError(f"its answer begins with {magic!r} and kind {kind}, which is no answer")
         if n_bytes > MAX_ANSWER_BYTES:
-            raise _BrokenError(f"its answer has {n_bytes} bytes; at most {MAX_ANSWER_BYTES}")
+            raise _ProtocolError(f"its answer has {n_bytes} bytes; at most {MAX_ANSWER_BYTES}")
         if number != self._n_asked:
-            raise _BrokenError(f"it answers request {number}; the last one was {self._n_asked}")
+            raise _ProtocolError(f"it answers request {number}; the last one was {self._n_asked}")
         return kind, printable(self._receive(n_bytes, until).decode("utf-8", "replace"), 300)
 
     def _receive(self, n_bytes: int, until: float) -> bytes:
@@ -124,7 +124,7 @@ class PipedProgram:
             self._await(until, [self._ends[2]], [])
             chunk = self._ends[2].read(n_bytes - len(received))
             if chunk == b"":
-                raise _BrokenError
+                raise _ProtocolError
             received += chunk or b""
         return received
 
@@ -135,7 +135,7 @@ class PipedProgram:
             if any(select.select(readers, writers, [], 0 if has_ended else max(min(left_s, MAX_WAIT_S), 0))):
                 return
             if has_ended:
-                raise _BrokenError
+                raise _ProtocolError
             if left_s <= 0:
-                raise _BrokenError(f"no complete answer within {self._timeout_s:g} s (timeout_s)")
+                raise _ProtocolError(f"no complete answer within {self._timeout_s:g} s (timeout_s)")
             self.program.watch.look()

@@ -289,9 +289,9 @@ class Program:
         return Finished(exit_code, is_timed_out, wall_s, self.watch.peak_bytes, self.watch.source, stdout, stderr)
 
 
-def run_program(words: Sequence[str], *, timeout_s: float, **how: Any) -> Finished:
-    """Run ``words`` as a ``Program`` until it ends or after ``timeout_s``; ``how``: its arguments."""
-    program, is_timed_out = Program(words, **how), False
+def run_program(words: Sequence[str], *, timeout_s: float, **options: Any) -> Finished:
+    """Run ``words`` as a ``Program`` until it ends or after ``timeout_s``; ``options``: its arguments."""
+    program, is_timed_out = Program(words, **options), False
     try:
         is_timed_out = not program.ends_within(timeout_s)
     finally:

@@ -14,7 +14,7 @@ from su3d_bench.core.compiled import njit
 from su3d_bench.datasets.procedural.materials import Texture
 from su3d_bench.datasets.procedural.rendering.noise_kernels import noise3
 from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
-from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference
+from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference, _highlight
 
 compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 inlined: Any = njit(cache=True, inline="never")
@@ -174,22 +174,6 @@ def wear_off(texture, material, materials, light):  # type: ignore[no-untyped-de
             light[i, 0] *= worn * (1 + hue)
             light[i, 1] *= worn
             light[i, 2] *= worn * (1 - hue)
-
-
-@inlined
-def _highlight(nx, ny, nz, dx, dy, dz, wx, wy, wz, lights, gloss):  # type: ignore[no-untyped-def]
-    """As in ``shade_kernels``, without the square root and division of lights that are not near the reflection."""
-    facing = dx * nx + dy * ny + dz * nz
-    rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
-    total = gloss * 0.10 * max(0.0, rz + 0.2)
-    for k in range(lights.shape[0]):
-        lx, ly, lz = lights[k, 0] - wx, lights[k, 1] - wy, lights[k, 2] - wz
-        along, square = rx * lx + ry * ly + rz * lz, lx * lx + ly * ly + lz * lz
-        if along > 0 and along * along > 0.63 * square:  # below 0.8 squared, for any rounding
-            cosine = along / (math.sqrt(square) + 1e-6)
-            if cosine > 0.8:
-                total += gloss * 0.5 * lights[k, 3] * cosine ** (20.0 + 60.0 * gloss)
-    return np.float32(total)
 
 
 @inlined

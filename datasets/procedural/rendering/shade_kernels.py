@@ -50,7 +50,11 @@ def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light
         lr, lg, lb = _between(light, i0, i1, i2, b0, b1, b2)
         spark = np.float32(0.0)
         if gloss > 0.1:
-            spark = _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, gloss)
+            dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
+            length = math.sqrt(dx * dx + dy * dy + dz * dz)
+            nx, ny, nz = _between(normals, i0, i1, i2, b0, b1, b2)
+            wx, wy, wz = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+            spark = _highlight(nx, ny, nz, dx / length, dy / length, dz / length, wx, wy, wz, lights, gloss)
             spark *= min(1.0, 1.3 * (lr + lg + lb) / 3)
         rgb[i, 0] = _encode(r * (lr + glow) + spark)
         rgb[i, 1] = _encode(g * (lg + glow) + spark)
@@ -79,21 +83,18 @@ def _encode(value):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, gloss):  # type: ignore[no-untyped-def]
-    nx, ny, nz = _between(normals, i0, i1, i2, b0, b1, b2)
-    dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    wx, wy, wz = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
-    dx, dy, dz = dx / length, dy / length, dz / length
+def _highlight(nx, ny, nz, dx, dy, dz, wx, wy, wz, lights, gloss):  # type: ignore[no-untyped-def]
+    """The reflection of lights, and of the bright upper half of a room, along a unit ray at a point with a normal."""
     facing = dx * nx + dy * ny + dz * nz
     rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
-    total = gloss * 0.10 * max(0.0, rz + 0.2)  # reflection of the bright upper half of a room
+    total = gloss * 0.10 * max(0.0, rz + 0.2)
     for k in range(lights.shape[0]):
         lx, ly, lz = lights[k, 0] - wx, lights[k, 1] - wy, lights[k, 2] - wz
-        distance = math.sqrt(lx * lx + ly * ly + lz * lz) + 1e-6
-        cosine = (rx * lx + ry * ly + rz * lz) / distance
-        if cosine > 0.8:
-            total += gloss * 0.5 * lights[k, 3] * cosine ** (20.0 + 60.0 * gloss)
+        along, square = rx * lx + ry * ly + rz * lz, lx * lx + ly * ly + lz * lz
+        if along > 0 and along * along > 0.63 * square:  # below 0.8 squared, for any rounding
+            cosine = along / (math.sqrt(square) + 1e-6)
+            if cosine > 0.8:
+                total += gloss * 0.5 * lights[k, 3] * cosine ** (20.0 + 60.0 * gloss)
     return np.float32(total)
 
 
