@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ from su3d_bench.core.safe_output import escaped_json, plain_value
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.version import __version__
 from su3d_bench.formats.tables.table import Prose, Table
+from su3d_bench.reports.tables.costs import COSTS
 from su3d_bench.reports.tables.formats import html_tables
 
 HERE = Path(__file__).parent
@@ -44,14 +45,9 @@ def page_html(
 
     ``command``, the date, and version and commit of the program are at its top.
     """
-    script = (
-        "(() => {\n'use strict';\n"
-        + "\n".join(file_text(HERE / f"scripts/{name}.js") for name in SCRIPTS)
-        + "\n})();\n"
-    )
     return rendered(
         HERE,
-        script,
+        _script(HERE / f"scripts/{name}.js" for name in SCRIPTS),
         title=title,
         created=_creation(command),
         data=embedded_json(numbers),
@@ -59,6 +55,12 @@ def page_html(
         maps=maps,
         galleries=[embedded_json(gallery) for gallery in galleries],
     )
+
+
+def _script(files: Iterable[Path]) -> str:
+    """Return the scripts in ``files``, with the costs of methods and their labels, as one script."""
+    costs = f"const COSTS = {escaped_json([*COSTS.items()])};"
+    return "\n".join(["(() => {", "'use strict';", costs, *map(file_text, files), "})();", ""])
 
 
 def _creation(command: str) -> dict[str, str]:
@@ -73,11 +75,9 @@ def registry_page_html(
     kind: Kind, title: str, data: Mapping[str, Any], without_scripts: Sequence[Table | Prose] = ()
 ) -> str:
     """Return a page of a registry site. ``data``: plain values; ``without_scripts``: shown without JavaScript."""
-    files = (HERE / "scripts/elements.js", HERE / "scripts/costs.js", REGISTRY / "page.js")
-    script = "(() => {\n'use strict';\n" + "\n".join(map(file_text, files)) + "\n})();\n"
     return rendered(
         REGISTRY,
-        script,
+        _script((HERE / "scripts/elements.js", HERE / "scripts/costs.js", REGISTRY / "page.js")),
         begins_with=file_text(HERE / STYLE),
         title=title,
         kind=kind,

@@ -22,8 +22,7 @@ const datasetsOf = (board) => board.datasets.join(', ');
 const scenesText = (board) => `${plural(board.scenes.length, 'scene')} of ${datasetsOf(board)}`;
 // Without the CPU family and model numbers, which are on the method's page.
 const shortHardware = (row) => row.hardware.replace(/ \(cpu family[^)]*\)/, '');
-const SIZES = [['rate_hz', 'Real time, Hz'], ['peak_mib', 'Peak MiB'], ['gpu_mib', 'GPU MiB'], ['saved_mib', 'Saved map, MiB'],
-  ['n_points', 'Points'], ['n_instances', 'Instances']];
+const SIZES = COSTS.filter(([key]) => !['frame_s', 'map_s'].includes(key));
 const sizeText = (value) => (isNumber(value) ? countText(Number(value.toPrecision(3))) : '–');
 const ranksText = (row) => (!row.ranks ? '–'
   : row.ranks[0] === row.ranks[1] ? String(row.ranks[0]) : `${row.ranks[0]} to ${row.ranks[1]}`);

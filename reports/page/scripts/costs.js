@@ -1,11 +1,5 @@
 // Cost against quality on the pages of runs and of registries. Entries: {method, metric, value, machine, data} and costs;
-// only entries of one machine and of the same data, rules included, share a plot.
-
-const COSTS = [
-  ['frame_s', 'seconds per frame'], ['map_s', 'seconds per frame, without perception'], ['peak_mib', 'peak memory, MiB'],
-  ['gpu_mib', 'GPU memory, MiB'], ['saved_mib', 'saved map, MiB'], ['n_points', 'map points'],
-  ['rate_hz', 'frames per second that arrive in real time'],
-];
+// only entries of one machine and of the same data, rules included, share a plot. COSTS: [key, label] of each cost.
 
 // The points, by rising cost, for which no other has a higher value at the same cost or less.
 function frontOf(points) {
@@ -14,7 +8,8 @@ function frontOf(points) {
 }
 
 function costPlots(entries) {
-  const known = COSTS.filter(([key]) => entries.some((one) => isNumber(one[key]) && isNumber(one.value)));
+  const isKnown = (key) => !key.startsWith('n_') && entries.some((one) => isNumber(one[key]) && isNumber(one.value));
+  const known = COSTS.filter(([key]) => isKnown(key)).sort(([a], [b]) => (a === 'rate_hz') - (b === 'rate_hz'));
   if (!known.length) return h('div');
   const unique = (values) => [...new Set(values)], methods = unique(entries.map((one) => one.method)), place = h('div');
   const metrics = unique(entries.map((one) => one.metric));
