@@ -11,9 +11,9 @@ import numpy as np
 
 from su3d_bench.analysis.identity import over_time
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.interfaces import HasChanges, UsesGroundTruth
+from su3d_bench.core.interfaces import Encoder, HasChanges, UsesGroundTruth
 from su3d_bench.core.maps import DenseFeatures, Instances
-from su3d_bench.core.types import BoolArray, Float32Array, Frame, GroundTruth, Int64Array, SceneChange
+from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array, SceneChange
 from su3d_bench.formats.tables.table import NOT_MEASURED, Table, percent, text_table
 from su3d_bench.metrics import changes as metric
 from su3d_bench.metrics.changes import NEVER, MapAt, Pairs, Places
@@ -54,7 +54,7 @@ def changes(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str], 
 
     Raises ``ConfigError`` as ``over_time``, and for a scene that does not change.
     """
-    methods, rules, jobs, _ = over_time(run, methods, protocols)
+    methods, rules, jobs, encoder = over_time(run, methods, protocols)
     counts: dict[tuple[str, str], list[_Counts]] = {(method, one.name): [] for one in rules for method in methods}
     for job in jobs:
         scene = SceneData(job, report)
@@ -69,7 +69,7 @@ def changes(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str], 
                 key = len(scene.frames(fed)), fed.corruption  # the oracle's, which uses none, are those of another
                 if key not in known:
                     known[key] = places_of(change, scene.truth(one.ground_truth), one, scene.clean_frames(fed))
-                counts[part.name, one.name].append(_count(run, known[key], part, one, scene.maps(fed)))
+                counts[part.name, one.name].append(_count(known[key], part, one, scene.maps(fed), encoder))
     thresholds = {one.name: one.thresholds for one in rules}
     return [Changes(*names, _values(each, thresholds[names[1]])) for names, each in counts.items()]
 
@@ -122,31 +122,24 @@ def _names(change: SceneChange, truth: GroundTruth, rules: ProtocolRules, ids: I
     return [name_of[class_of[one]] if n_objects[class_of[one]] == 1 else "" for one in ids.tolist()]
 
 
-def _answers(
-    run: FinishedRun, known: _Known, found: MapAt, is_asked: BoolArray, rules: ProtocolRules, path: Path | None
-) -> Int64Array:
-    """Right answers of the map in ``path`` to "where is the NAME?", and questions (2,): about those of the places
-    ``is_asked`` whose object has been seen and is the only one of its name; without ``path``, the oracle's answers."""
-    places, _, names = known
-    asked = np.flatnonzero(is_asked & (places.after[0] <= found.n_updates) & (np.array(names) != ""))
-    if path is None:
-        first = np.array([np.flatnonzero(found.ids == places.object_ids[row])[0] for row in asked], np.int64)
-        return metric.answers(found, asked, first)
-    prediction = read_prediction(path)
-    assert not isinstance(prediction, DenseFeatures)
-    if prediction.features is None:
-        return np.zeros(2, np.int64)
-    texts = [names[row] for row in asked.tolist()]
-    return metric.answers(found, asked, first_instances(rules, texts, prediction, run.encoder()))
-
-
 def _count(
-    run: FinishedRun, known: _Known, part: Part, rules: ProtocolRules, files: Sequence[tuple[Path, int]]
+    known: _Known, part: Part, rules: ProtocolRules, files: Sequence[tuple[Path, int]], encoder: Encoder
 ) -> _Counts:
-    """The counts of a method's maps in ``files``, each after so many updates; the oracle has what is there and seen."""
-    (places, points, _), is_oracle = known, isinstance(build_method(part), UsesGroundTruth)
-    maps = [places.perfect(n_updates) for _, n_updates in files if is_oracle]
-    for path, n_updates in () if is_oracle else files:
+    """The counts of a method's maps in ``files``, each after so many updates; the oracle has what is there and seen.
+
+    "Where was the NAME?" is asked of the last map before the change, about places that are left, and "where is it?" of
+    the last map, about new places, if the object has been seen and no other has its name.
+    """
+    (places, points, names), is_oracle = known, isinstance(build_method(part), UsesGroundTruth)
+    named = np.flatnonzero(np.array(names) != "")
+    texts = [names[row] for row in named.tolist()]
+    maps, answer_of = list[MapAt](), dict[int, Int64Array | None]()  # the instance that each text names, by updates
+    for path, n_updates in files:
+        if is_oracle:
+            maps.append(places.perfect(n_updates))
+            is_named = maps[-1].ids == places.object_ids[named][:, None]
+            answer_of[n_updates] = np.where(is_named.any(axis=1), is_named.argmax(axis=1), -1)
+            continue
         prediction = read_prediction(path)
         if isinstance(prediction, DenseFeatures):
             raise ConfigError(f"{part.name}: its maps have no instances; choose others with --methods")
@@ -155,11 +148,16 @@ def _count(
         moved = transfer_masks(prediction.points, masks, points, cap_m, voxel_m)
         ids = prediction.ids if isinstance(prediction, Instances) and len(prediction.ids) else np.arange(len(masks))
         maps.append(places.map_at(n_updates, moved, np.asarray(ids, np.int64), scores))
+        has_features = prediction.features is not None
+        answer_of[n_updates] = first_instances(rules, texts, prediction, encoder) if has_features else None
     pairs, before = dict(metric.count_changes(places, maps)), metric.last_before_change(places, maps)
-    path_of = {} if is_oracle else {n_updates: path for path, n_updates in files}
-    for name, one, is_asked in (("then", before, places.is_left), ("now", maps[-1], places.is_new)):
-        if one is not None:
-            pairs[f"where {name}"] = _answers(run, known, one, is_asked, rules, path_of.get(one.n_updates))
+    for name, found, is_asked in (("then", before, places.is_left), ("now", maps[-1], places.is_new)):
+        first = None if found is None else answer_of[found.n_updates]
+        if found is not None and first is not None:
+            asked = (is_asked & (places.after[0] <= found.n_updates))[named]
+            pairs[f"where {name}"] = metric.answers(found, named[asked], first[asked])
+        else:
+            pairs[f"where {name}"] = np.zeros(2, np.int64)
     if before is None or not getattr(build_method(part), "keeps_ids", False):
         return pairs, None
     return pairs, metric.count_stages(places, [before, maps[-1]], rules.thresholds)
