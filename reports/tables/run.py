@@ -135,7 +135,7 @@ def not_scored_lines(reasons: Iterable[UnscoredRecord]) -> list[str]:
         first = alike[0]
         scene = printable(first.scene)
         why = first.reason if first.reason.startswith((first.scene, scene)) else f"{scene}: {first.reason}"
-        methods = ", ".join(dict.fromkeys(reason.method for reason in alike))
+        methods = some(list(dict.fromkeys(reason.method for reason in alike)), MAX_NAMES)
         n_scenes = len({reason.scene for reason in alike})
         protocols.setdefault((methods, why, n_scenes), []).append(protocol)
     return [

@@ -101,7 +101,7 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
     is_optional = value.startswith("[")
     several = value[1:-1] if is_optional else value
     metavar = several.removesuffix("...")
-    settings: dict[str, Any] = {"help": text}
+    settings: dict[str, Any] = {"help": text.replace("%", "%%")}
     if metavar:
         settings["metavar"] = metavar
     if is_optional or several != metavar:
@@ -149,7 +149,7 @@ def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
     summary = " ".join(summary.split())
     parser: Parser = verbs.add_parser(
         name,
-        help=summary[:1].lower() + summary[1:].rstrip("."),
+        help=(summary[:1].lower() + summary[1:].rstrip(".")).replace("%", "%%"),
         description=summary,
         epilog="\n  ".join(["examples:", *map(str.strip, examples.splitlines())]),
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -50,7 +50,7 @@ def _add_tables(verbs: Verbs) -> None:
         ("metrics", "metrics to use (default: the headline metrics)"),
     ):
         parser.option(f"--{name} {name[:-1].upper()}...", what, default=[])
-    parser.option("--intervals", "show 95 %% confidence intervals (over scenes)")
+    parser.option("--intervals", "show 95 % confidence intervals (over scenes)")
     parser.option("--ceiling", "show the ground-truth ceiling")
     parser.option("--scenes-count", "always show the number of scenes")
     parser.option("--significant", "mark the best only if significantly better (p < 0.05)")
@@ -246,7 +246,7 @@ def _add_leaderboard(verbs: Verbs) -> None:
     parser = add_verb(verbs, "leaderboard", call_leaderboard)
     parser.option("folder DIR", "folder to search for runs", type=searched_folder)
     parser.shared("--protocols")
-    parser.option("--intervals", "show 95 %% confidence intervals (of scores and ranks)")
+    parser.option("--intervals", "show 95 % confidence intervals (of scores and ranks)")
     parser.shared("--format")
     parser.option("--out FILE", "file to write (default: print)", type=output_path)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from su3d_bench.corruptions.apply import Cell
     from su3d_bench.robustness.tolerance import Tolerance
     from su3d_bench.runs.finished import FinishedRun
+    from su3d_bench.runs.runner import RunResult
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -134,7 +136,23 @@ def call_run(arguments: argparse.Namespace) -> int:
     minutes = sum(row.seconds for row in estimate(plan) if not row.is_done) / plan.n_workers / 60
     cells = f"{counted(len(plan.methods), 'cell')} on {counted(len(plan.jobs), 'scene')}"
     output.remark(f"{cells}: about {minutes:.0f} minutes", quiet=arguments.quiet)
-    return execute(plan, arguments)
+    return execute(plan, arguments, _answer_sweep)
+
+
+def _answer_sweep(result: RunResult, arguments: argparse.Namespace) -> None:
+    """Print the changes of each protocol's first metric, the run folder, and commands for next steps."""
+    from su3d_bench.robustness.measures import sweep_result
+    from su3d_bench.robustness.tables import is_of_embedded, sweep_tables
+    from su3d_bench.runs.verify import read_checked
+
+    folder = result.plan.folder.path
+    run = read_checked(folder)
+    scored = [name for name in run.protocols if any(run.results[method, name].result for method in run.methods)]
+    swept = [sweep_result(run, name, run.rules(name).headline[0]) for name in scored]
+    tables = [table for one in swept for table in sweep_tables(one, of_embedded=is_of_embedded(run))]
+    output.answer_tables(arguments, [one.to_json() for one in swept], tables)
+    lines = [f"run folder: {folder}", f"next: su3d-bench robustness report {shlex.quote(str(folder))} --tolerance"]
+    output.remark(*result.remarks, *lines, quiet=arguments.quiet)
 
 
 def call_report(arguments: argparse.Namespace) -> None:

@@ -13,10 +13,14 @@ from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from su3d_bench.core.config import Settings
     from su3d_bench.runs.existing import Into
     from su3d_bench.runs.plan import Plan
     from su3d_bench.runs.runner import RunResult
+
+    Answer = Callable[[RunResult, argparse.Namespace], None]
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -104,8 +108,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     return plan
 
 
-def execute(plan: Plan, arguments: argparse.Namespace) -> int:
-    """Run the plan, or with ``--dry-run`` print its estimated cost."""
+def execute(plan: Plan, arguments: argparse.Namespace, answer: Answer | None = None) -> int:
+    """Run the plan and print its tables, or ``answer`` if nothing failed; with ``--dry-run`` print the cost."""
     from su3d_bench.runs.runner import run_plan
 
     if arguments.dry_run:
@@ -115,7 +119,7 @@ def execute(plan: Plan, arguments: argparse.Namespace) -> int:
         remark(f"{counted(len(plan.jobs), 'scene')}, run folder: {plan.folder.path}", quiet=arguments.quiet)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
-    _answer_result(result, arguments)
+    (answer if answer and result.is_complete else _answer_result)(result, arguments)
     remark(*dict.fromkeys(f"su3d-bench: {line}" for _, _, line in result.failures))
     if result.is_complete:
         return EXIT_DONE

@@ -33,9 +33,10 @@ def is_of_embedded(run: FinishedRun) -> bool:
 
 def sweep_notes(result: SweepResult, *, of_embedded: bool) -> list[str]:
     """What the columns of the summary mean."""
+    n = len(result.scenes)
+    interval = f", with the 95 % interval over {n} scenes" if n > 1 else ""
     return [
-        "families: mean change over severities, then over corruptions, in points, with the 95 % interval over "
-        f"{counted(len(result.scenes), 'scene')}; mean: over families",
+        f"families: mean change over severities, then over corruptions, in points{interval}; mean: over families",
         f"mCE: error relative to that of {result.baseline}; resilience: share of the clean value that is kept "
         "(Robo3D, Kong et al. 2023). A weak method loses little: read both beside the clean value",
         *([EMBEDDED] if of_embedded else []),

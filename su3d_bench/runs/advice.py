@@ -20,10 +20,10 @@ from su3d_bench.runs.runner import RunResult
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
 
-# Used if there is no earlier run to measure: one update of opensu3d under the embedded profile at 640x480, and
-# reading, scoring and drawing one room under two protocols, both on two cores of a 2020s server.
-GUESSED_UPDATE_S = 0.5
-GUESSED_SCENE_S = 15.0
+# Seconds on two cores of a 2020s server: reading a scene of 40 frames; scoring under two protocols, and drawing, each
+# method; and, if there is no earlier run to measure, an update of opensu3d under the embedded profile at 640x480.
+SCENE_S, SCORING_S, DRAWING_S = 10.0, 1.5, 2.0
+GUESSED_UPDATE_S = 0.3
 N_RECENT = 8
 
 
@@ -62,7 +62,8 @@ def estimate(plan: Plan) -> list[JobEstimate]:
         each_s = GUESSED_UPDATE_S if measured is None else measured
         if job.config.realtime:  # a busy method processes what fits into the recording's duration
             n_updates = min(n_updates, math.ceil(n_updates / job.config.realtime / max(each_s, 1e-9)))
-        seconds = GUESSED_SCENE_S + (1 + is_measured(job.config)) * n_updates * each_s
+        around_s = SCORING_S + DRAWING_S * job.config.pictures + SCENE_S * (part is job.methods[0])
+        seconds = around_s + (1 + is_measured(job.config)) * n_updates * each_s
         rows.append(JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark))
     return rows
 

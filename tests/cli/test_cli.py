@@ -124,6 +124,13 @@ def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.
     assert capsys.readouterr().out.startswith(f"usage: su3d-bench{prog} [-h]")
 
 
+def test_help_of_every_command_and_group_shows_its_text_as_written(capsys: pytest.CaptureFixture[str]) -> None:
+    commands = {words for words, _ in verbs()}
+    for words in sorted(commands | {words[:1] for words in commands}):
+        assert main([*words, "--help"]) == 0
+        assert "%%" not in capsys.readouterr().out
+
+
 def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
     meanings: dict[str, dict[tuple[str, str], str]] = {}
     names: dict[str, set[str]] = {}

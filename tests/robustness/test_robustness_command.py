@@ -46,7 +46,10 @@ def test_cell_run_alone_equals_the_cell_of_the_sweep(
     for text, more in (("depth/holes/4", ""), ("time/lost-bursts/4", "--scenes rooms/studio0 --jobs 2")):
         out = tmp_path / text.replace("/", "-")
         assert main(f"robustness run {ROOM} --only {text} --out {out} {more}".split()) == 0
-        assert f"2 cells on {'2 scenes' if more else '1 scene'}: about " in capsys.readouterr().err
+        said = capsys.readouterr()
+        assert f"2 cells on {'2 scenes' if more else '1 scene'}: about " in said.err
+        assert f"next: su3d-bench robustness report {out} --tolerance" in said.err
+        assert "under corruptions**" in said.out
         name = f"opensu3d~{text.replace('/', '-')}"
         assert prediction(str(out), name) == prediction(str(sweep), name)
 
