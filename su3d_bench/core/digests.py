@@ -19,7 +19,7 @@ PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 NON_SCORING_PACKAGES = ("analysis", "api", "cli", "fetching", "reports", "reproducing", "human_eval")
 # Not part of the program: files of Python and file managers, documentation, type-checker markers.
 NO_CODE = ("__pycache__", ".", ".pyc", ".md", "py.typed")
-NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")
+NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba", "av")
 RECORDED_PACKAGES = ("su3d-bench", *NUMERIC_PACKAGES, "pandas", "pydantic", "torch", "transformers")
 
 

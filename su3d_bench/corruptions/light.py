@@ -1,6 +1,6 @@
-"""Corruptions of colour by light and motion: too little light, too much, and a moving camera.
+"""Corruptions of colour by light, motion and transmission: too little light, too much, a moving camera, compression.
 
-Each computes with linear light, as the sensor does, with the functions of ``sensors.colour``.
+The first three compute with linear light, as the sensor does, with the functions of ``sensors.colour``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ SHOT, READ = 1e-4, 6.3e-9  # variances at base gain: lowest of Brooks et al. 201
 MAX_GAIN_STOPS = 6.0  # ISO 100 to 6400, a common limit of cameras for video; then images get darker
 FRAMES_PER_SECOND = 30.0
 N_SAMPLES = 32  # along the motion; fewer where it is shorter
+N_CODED = 12  # frames of a video, so that the last is coded from others
 
 
 def low_light(frame: Frame, stops: float, rng: Generator, recording: Recording) -> Frame:
@@ -40,6 +41,13 @@ def motion_blur(frame: Frame, exposure_ms: float, rng: Generator, recording: Rec
     return replace(frame, rgb=colour.to_srgb(blurred))
 
 
+def compressed_video(frame: Frame, crf: float, rng: Generator, recording: Recording) -> Frame:
+    """Colour as the last frame of H.264 video that starts ``N_CODED`` - 1 frames earlier, or with the recording."""
+    before = range(max(recording.index - N_CODED + 1, 0), recording.index)
+    images = [*(recording.frames[k].rgb for k in before), frame.rgb]
+    return replace(frame, rgb=colour.last_of_video(images, crf))
+
+
 ROWS: tuple[Corruption, ...] = (
     Corruption(
         "light", "low-light", "frame", low_light, "stops of light lost", (2, 4, 6, 7, 8),
@@ -53,5 +61,9 @@ ROWS: tuple[Corruption, ...] = (
     Corruption(
         "light", "motion-blur", "frame", motion_blur, "ms of exposure at 30 Hz", (5, 10, 15, 22, 33),
         "ours: up to the whole interval between two frames, the longest exposure at that rate", uses_poses=True,
+    ),
+    Corruption(
+        "light", "compressed-video", "frame", compressed_video, "CRF of H.264", (23, 29, 35, 41, 47),
+        "x264's default, then half the bit rate each (FFmpeg's wiki: 6 more halve it)",
     ),
 )  # fmt: skip

@@ -23,12 +23,13 @@ INDEX = 9
 def wide(scene: str = SCENES[0]) -> Recording:
     """The recording at four times its resolution, 640 px wide: less is moved by no pixel in 5 ms."""
     source = recording(scene, INDEX)
-    frame, camera = source.frames[INDEX], np.diag([4.0, 4, 1]) @ source.frames[INDEX].intrinsics
+    return replace(source, frames=[enlarged(frame) for frame in source.frames])
+
+
+def enlarged(frame: Frame) -> Frame:
     rgb, depth_m = (np.repeat(np.repeat(image, 4, axis=0), 4, axis=1) for image in (frame.rgb, frame.depth_m))
-    frames = [*source.frames]
-    frames[INDEX] = replace(frame, rgb=rgb, depth_m=depth_m, intrinsics=camera)
     rgb.setflags(write=False)
-    return replace(source, frames=frames)
+    return replace(frame, rgb=rgb, depth_m=depth_m, intrinsics=np.diag([4.0, 4, 1]) @ frame.intrinsics)
 
 
 def changed(row: Corruption, source: Recording, value: float, seed: int = 3, scene: str = SCENES[0]) -> Frame:
@@ -126,3 +127,27 @@ def test_motion_blur_uses_the_recording_and_not_the_frames_own_pose() -> None:
     rng = generator(ROWS["motion-blur"], 0, "scene")
     other = cast(Frame, ROWS["motion-blur"].function(elsewhere, 16.0, rng, source))
     assert other.rgb.tobytes() == changed(ROWS["motion-blur"], source, 16.0).rgb.tobytes()
+
+
+def test_video_codes_a_frame_as_changes_from_the_frames_before_it() -> None:
+    row, rng = ROWS["compressed-video"], np.random.default_rng(0)
+    noise = np.kron(rng.integers(0, 256, (12, 16, 3), np.uint8), np.ones((4, 4, 1), np.uint8))[:47, :63]  # odd sides
+    frame = Frame(0, 0.0, noise, np.ones(noise.shape[:2], np.float32), np.eye(4), np.eye(3))
+    other = replace(frame, rgb=np.roll(noise, 20, axis=1))
+    received = {
+        name: changed(row, Recording((*before, frame), np.stack([np.eye(4)] * 20), len(before)), 35.0).rgb
+        for name, before in {
+            "first": (),
+            "still": (frame,) * 11,
+            "moving": (other,) * 11,
+            "longer": (other,) * 19,
+        }.items()
+    }
+    assert received["first"].shape == noise.shape
+    assert psnr(received["still"], noise) > psnr(received["first"], noise)  # refined by each frame
+    assert received["moving"].tobytes() != received["still"].tobytes()
+    assert received["longer"].tobytes() == received["moving"].tobytes()  # the last 12 count
+
+
+def test_video_keeps_a_grey_image() -> None:
+    assert np.abs(changed(ROWS["compressed-video"], grey(119), 47).rgb.astype(int) - 119).max() <= 2

@@ -6,11 +6,13 @@ Colour images are (H, W, 3): ``rgb`` sRGB bytes, ``linear`` float32 light in 0..
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 from functools import cache, reduce
 
 import numpy as np
 from numpy.random import Generator
 
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import Float32Array as Light
 from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.corruptions.sensors.depth import inverse_depth, normal_noise
@@ -114,3 +116,29 @@ def jpeg(rgb: UInt8Array, quality: int | None) -> UInt8Array:
 
     data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
+
+
+def last_of_video(images: Sequence[UInt8Array], crf: float) -> UInt8Array:
+    """The last of ``images``, all (H, W, 3), as a receiver of H.264 video of them sees it; ``crf``: 0 best to 51 worst.
+
+    As streamed by a camera, without delay: the first is coded on its own, the others as changes from earlier ones.
+    Raises ``ConfigError`` if PyAV has no encoder of H.264.
+    """
+    import av
+
+    if "libx264" not in av.codecs_available:
+        raise ConfigError("compressed video: PyAV was built without libx264; install its wheel: pip install av")
+    height, width = images[0].shape[:2]
+    rim = ((0, height % 2), (0, width % 2), (0, 0))  # colour has half the resolution, so sides must be even
+    encoder, decoder = av.VideoCodecContext.create("libx264", "w"), av.VideoCodecContext.create("h264", "r")
+    encoder.thread_count = decoder.thread_count = 1  # the same bytes on any number of cores
+    encoder.width, encoder.height = width + width % 2, height + height % 2
+    encoder.pix_fmt, encoder.framerate = "yuv420p", Fraction(30)
+    encoder.options = {"crf": f"{crf:g}", "tune": "zerolatency"}
+    packets = []
+    for image in images:
+        frame = av.VideoFrame.from_ndarray(np.pad(image, rim, "edge"), "rgb24")
+        packets += encoder.encode(frame.reformat(format="yuv420p"))
+    packets += encoder.encode(None)
+    received = [frame for packet in (*packets, None) for frame in decoder.decode(packet)]
+    return np.asarray(received[-1].to_ndarray(format="rgb24")[:height, :width], np.uint8)
