@@ -117,7 +117,7 @@ def figure_format(path: Path) -> str:
     """The format of a figure by the suffix of ``path``; ``ConfigError`` if it is not one of ``METADATA``."""
     if (kind := path.suffix.lower().removeprefix(".")) not in METADATA:
         raise ConfigError(
-            f"--out {printable(str(path), 200)}: unknown format of a figure; use a suffix of {', '.join(METADATA)}"
+            f"{printable(str(path), 200)}: unknown format of a figure; use a suffix of {', '.join(METADATA)}"
         )
     return kind
 

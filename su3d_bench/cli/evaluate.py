@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.options import Verbs, add_verb, output_path
+from su3d_bench.cli.options import Verbs, add_verb, run_folder
 from su3d_bench.cli.output import answer_tables, remark, steps
 from su3d_bench.core.errors import ConfigError
 
@@ -28,7 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("paths [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option("--name NAME", "name of the method (default: name of --out)")
     parser.option("--predictions METHOD=PREDICTIONS...", "predictions of several methods", action="extend", default=[])
-    parser.option("--out DIR", "write a run folder, for compare, check, report, sheets and query", type=output_path)
+    parser.option("--out DIR", "write a run folder, for compare, check, report, sheets and query", type=run_folder)
     parser.option("--dataset DATASET", "dataset with the ground truth, in $SU3D_DATA: replica, scannet, ...")
     parser.option(
         "--ground-truth DIR",

@@ -180,6 +180,11 @@ def output_path(text: str) -> Path:
     return Path(text)
 
 
+def run_folder(text: str) -> Path:
+    """Option type: a run folder that the command writes, which may exist."""
+    return Path(text)
+
+
 def figure_path(text: str) -> Path:
     """Option type: a figure that the command writes, in a format that its suffix names."""
     from su3d_bench.reports.pictures.canvas import figure_format

@@ -1,7 +1,7 @@
 """Paths on the command line: which options are outputs, and the check that no output replaces or lies in an input.
 
-An option is an output if its type is ``output_path`` or ``figure_path``, or if it is ``--json``; every other path is
-an input. Folders that are only searched, such as that of ``report leaderboard``, may contain outputs.
+An option is an output if its type is in ``OUTPUTS``, or if it is ``--json``; every other path is an input. Folders that
+are only searched, such as that of ``report leaderboard``, may contain outputs.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.options import figure_path, output_path, searched_folder
+from su3d_bench.cli.options import figure_path, output_path, run_folder, searched_folder
 from su3d_bench.core.errors import ConfigError, shown
 
-RUN_VERBS = ("run", "ablate", "evaluate")  # whose --out may be an existing run
+OUTPUTS = (output_path, figure_path, run_folder)
 # Texts that contain the path of a file or folder; in other texts, such as METHOD, only files are inputs.
 TEXTS = ("A", "B", "RUN", "METHOD=PREDICTIONS", "METHOD=FILE", "KEY=VALUE", "FILE")
 FREE_TEXTS = (None, "TEXT", "NAME")
@@ -28,7 +28,7 @@ def data_root() -> Path:
 
 
 def is_output(action: argparse.Action) -> bool:
-    return action.type in (output_path, figure_path) or action.dest == "json"
+    return action.type in OUTPUTS or action.dest == "json"
 
 
 def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -39,13 +39,13 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     directory or one above it is an input, new files may be created there.
     """
     inputs: dict[tuple[int, int], tuple[Path, bool]] = {}
-    outputs: dict[str, Path] = {}
+    outputs: dict[str, tuple[Path, bool]] = {}
     for action in parser._actions:
         value = getattr(arguments, action.dest, None)
         if is_output(action):
             value = arguments.json_file if action.dest == "json" else value
             name = action.option_strings[0] if action.option_strings else str(action.metavar)
-            outputs |= {name: value} if isinstance(value, Path) else {}
+            outputs |= {name: (value, action.type is run_folder)} if isinstance(value, Path) else {}
         else:
             searched = action.type is searched_folder
             inputs |= {key: (path, searched) for path in _paths(action, value) if (key := _identity(path))}
@@ -54,7 +54,7 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     from su3d_bench.store.run_folder import JOBS, is_run  # slow to import
 
     data, here, written = _identity(data_root()), Path.cwd(), dict[Path, str]()
-    for name, path in outputs.items():
+    for name, (path, may_be_run) in outputs.items():
         real = Path(os.path.realpath(path))
         for place in (real, *real.parents, *Path(os.path.abspath(path)).parents):
             identity = _identity(place)
@@ -66,7 +66,7 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
                 fault = f"lies in {shown(found)}, which is an input"
             elif identity == data is not None and real.is_file() and not here.is_relative_to(place):
                 fault = f"is a file of the data root {shown(data_root())}"
-            elif is_run(place) and (place / JOBS).is_dir() and (place != real or arguments.verb not in RUN_VERBS):
+            elif is_run(place) and (place / JOBS).is_dir() and not (place == real and may_be_run):
                 fault = f"{'is' if place == real else 'lies in'} the run folder {shown(place)}"
             if fault is not None:
                 raise ConfigError(f"{name} {shown(path)}: {fault}; choose another place")

@@ -54,7 +54,7 @@ def add_parser(verbs: Verbs) -> None:
     _add_metric(parser)
     parser.option("--baseline METHOD", "method that mCE is relative to (default: the first)")
     parser.option("--tolerance", "also show the errors at which 95 % of the clean score is kept, between severities")
-    parser.option("--figure FILE", "figure to write (.png or .pdf)", type=output_path)
+    parser.option("--figure FIGURE", "figure to write (.pdf, .png or .svg)")
     parser.option("--out FILE", "file to write", type=output_path)
     parser.shared("--format")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, count, output_path, positive
+from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, count, positive, run_folder
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -70,7 +70,7 @@ def add_run_options(parser: Parser) -> None:
     parser.option("--schedule PATH", "run or schedule.csv to replay: the same frames, the same maps", type=Path)
     parser.option("--cost FILE", "CSV file of durations to simulate: device, and duration_ms or mean_ms and sd_ms")
     parser.shared("--set", "--config", "--dry-run", "--format")
-    parser.option("--out DIR", "run folder (default: a folder in runs/)", type=output_path)
+    parser.option("--out DIR", "run folder (default: a folder in runs/)", type=run_folder)
     into = parser.add_mutually_exclusive_group()
     what = "add scenes, methods and protocols to the run in --out"
     parser.option("--extend", what, into)

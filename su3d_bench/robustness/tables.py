@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from su3d_bench.analysis.comparison import Difference
 from su3d_bench.core.errors import counted
@@ -23,7 +24,9 @@ def sweep_tables(result: SweepResult, *, of_embedded: bool) -> list[Table | Pros
     heading = f"{result.protocol}: {result.metric} under corruptions"
     notes = sweep_notes(result, of_embedded=of_embedded)
     parts: list[Table | Prose] = [text_table("robustness", rows, heading=heading, notes=notes)]
-    return [*parts, *(_cells_table(method, result.metric) for method in result.methods)]
+    cells = [_cells_table(method, result.metric) for method in result.methods]
+    note = "value in the unit: change in points; * p < 0.05, sign-flip test with Holm's correction over the family"
+    return [*parts, *cells[:-1], *(replace(last, notes=(note,)) for last in cells[-1:])]
 
 
 def is_of_embedded(run: FinishedRun) -> bool:
@@ -64,8 +67,7 @@ def _cells_table(method: MethodResult, metric: str) -> Table:
     for name, cells in of_corruption.items():
         unit = " + ".join(one.corruption.unit for one in next(iter(cells.values())).cell.conditions)
         rows.append([name, unit, *(_cell(cells.get(severity)) for severity in severities)])
-    notes = ["value in the unit: change in points; * p < 0.05, sign-flip test with Holm's correction over the family"]
-    return text_table(f"robustness-{method.method}", rows, heading=method.method, caption=f": {metric}", notes=notes)
+    return text_table(f"robustness-{method.method}", rows, heading=method.method, caption=f": {metric}")
 
 
 def _severity(one: CellResult) -> str:

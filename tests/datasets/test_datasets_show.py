@@ -113,7 +113,7 @@ def test_scan_without_recording_shows_its_ground_truth_or_mesh(
     [
         (["replica/*"], "datasets show replica/*: 2 scenes match (replica/room0, replica/room1, ...); name one"),
         (["replica/rom0"], "no scene matches 'replica/rom0'; did you mean 'replica/room0'?"),
-        (["replica/room0", "--out", "x.jpg"], "--out x.jpg: unknown format of a figure; use a suffix of pdf"),
+        (["replica/room0", "--out", "x.jpg"], "x.jpg: unknown format of a figure; use a suffix of pdf"),
     ],
 )
 def test_each_wrong_request_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

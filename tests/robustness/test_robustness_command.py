@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -67,6 +68,17 @@ def test_corrupted_openmask3d_shares_proposals_and_segments_a_frame_once(
     assert main(f"{words} pose/jitter-rotation --out {tmp_path / 'alone'}".split()) == 0
     name = "openmask3d~pose-jitter-rotation-2"
     assert prediction(str(tmp_path / "both"), name) == prediction(str(tmp_path / "alone"), name)
+
+
+def test_sweep_is_resumed_and_extended_in_its_folder(sweep: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(sweep, tmp_path / "run")
+    words = f"robustness run {ROOM} --corruptions {NAMES} --out {out} --severities"
+    cell = out / "scenes" / "rooms.bathroom0" / "opensu3d~pose-jitter-translation-4"
+    shutil.rmtree(cell)
+    assert main(f"{words} 0 4".split()) == 0
+    assert prediction(str(out), cell.name) == prediction(str(sweep), cell.name)
+    assert main(f"{words} 2 --extend".split()) == 0
+    assert len(list(cell.parent.iterdir())) == 2 + 3 * len(NAMES.split())  # with the oracle
 
 
 def test_report_has_every_family_and_writes_its_figure(
