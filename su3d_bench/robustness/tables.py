@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from su3d_bench.analysis.comparison import Difference
-from su3d_bench.core.errors import counted
 from su3d_bench.corruptions.model import Corruption
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
 from su3d_bench.robustness.measures import CellResult, MethodResult, SweepResult
@@ -36,14 +35,17 @@ def is_of_embedded(run: FinishedRun) -> bool:
 
 def sweep_notes(result: SweepResult, *, of_embedded: bool) -> list[str]:
     """What the columns of the summary mean."""
-    n = len(result.scenes)
-    interval = f", with the 95 % interval over {n} scenes" if n > 1 else ""
     return [
-        f"families: mean change over severities, then over corruptions, in points{interval}; mean: over families",
+        "families: mean change over severities, then over corruptions, in points"
+        f"{_interval(len(result.scenes))}; mean: over families",
         f"mCE: error relative to that of {result.baseline}; resilience: share of the clean value that is kept "
         "(Robo3D, Kong et al. 2023). A weak method loses little: read both beside the clean value",
         *([EMBEDDED] if of_embedded else []),
     ]
+
+
+def _interval(n_scenes: int) -> str:
+    return f", with the 95 % interval over {n_scenes} scenes" if n_scenes > 1 else ""
 
 
 def _summary(method: MethodResult, families: Sequence[str]) -> list[str]:
@@ -92,8 +94,8 @@ def tolerance_tables(
     for corruption in corruptions.values():
         families.setdefault(corruption.family, []).append(corruption)
     caption = (
-        f": the largest error at which {100 * share:g} % of the clean {metric} under {protocol} is kept, with the 95 % "
-        f"interval over {counted(n_scenes, 'scene')}; '>': kept at the highest severity"
+        f": the largest error at which {100 * share:g} % of the clean {metric} under {protocol} is kept"
+        f"{_interval(n_scenes)}; '>': kept at the highest severity"
     )
     tables: list[Table | Prose] = []
     for family, own in families.items():
