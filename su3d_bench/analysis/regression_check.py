@@ -103,7 +103,7 @@ def no_cost_reason(run: FinishedRun, method: str) -> str | None:
     n_most = max((len(times) for times in timed), default=0)
     if n_most <= WARM_UP:
         what = f"has at most {counted(n_most, 'update')} per scene" if n_most else "uses no frames"
-        return f"{what}; measuring the cost takes at least {WARM_UP + 1}"
+        return f"{what}; measuring the cost takes at least {WARM_UP + 1} updates"
     measured = [times for times in timed if len(times) > WARM_UP]
     if any("method_ms" not in times.columns or None in (times.start_ms, times.close_ms) for times in measured):
         return "was timed by an older version, which did not measure around the method; run it again"

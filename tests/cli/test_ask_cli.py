@@ -130,7 +130,7 @@ def test_dry_run_reports_the_cost_and_sends_no_request(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", "--question-solver", "llm"]) == 0
-    assert "1 requests, 0 of them already answered; 1 to send to gpt-6-luna: about " in capsys.readouterr().out
+    assert "1 request, 0 of them already answered; 1 to send to gpt-6-luna: about " in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
     assert "no price in the table" in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run"]) == 0

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, Field, ValidationError
 
-from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError, printable
+from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError, counted, printable
 from su3d_bench.core.system.devices import require, require_installed
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply, ReplyStore, check_address, n_tokens
 
@@ -384,7 +384,7 @@ class Estimate:
         cost = "no price in the table" if self.usd is None else f"at most {self.usd:.4f} USD"
         models = ", ".join(self.models) or "no model"
         return (
-            f"{self.n_requests} requests, {self.n_stored} of them already answered; {to_send} to send to {models}: "
+            f"{counted(self.n_requests, 'request')}, {self.n_stored} of them already answered; {to_send} to send to {models}: "
             f"about {self.input_tokens:,} tokens in, at most {self.output_tokens:,} out, {cost}"
         )
 
