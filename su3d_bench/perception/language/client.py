@@ -384,8 +384,9 @@ class Estimate:
         cost = "no price in the table" if self.usd is None else f"at most {self.usd:.4f} USD"
         models = ", ".join(self.models) or "no model"
         return (
-            f"{counted(self.n_requests, 'request')}, {self.n_stored} of them already answered; {to_send} to send to {models}: "
-            f"about {self.input_tokens:,} tokens in, at most {self.output_tokens:,} out, {cost}"
+            f"{counted(self.n_requests, 'request')}, {self.n_stored} of them already answered; "
+            f"{to_send} to send to {models}: about {self.input_tokens:,} tokens in, "
+            f"at most {self.output_tokens:,} out, {cost}"
         )
 
 
