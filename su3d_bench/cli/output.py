@@ -25,6 +25,7 @@ MAX_UNSEEN = 8  # listed words
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: wide enough for a long bar, and for both bars
 MAX_BAR_LABEL = 80  # characters of the label
 LINE_EVERY_S = 10.0  # between lines of progress where there is no terminal
+MAPS_EVERY_S = 60.0  # the same for a run
 MEGABYTE, GIGABYTE = 10**6, 10**9
 
 
@@ -166,19 +167,28 @@ def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
 
 
 @contextmanager
-def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[Report]:
-    """A ``Report`` that shows progress while the block runs: bars on a terminal, elsewhere a line per finished scene.
+def progress(n_scenes: int, *, is_quiet: bool, n_maps: int = 0, last_step: str = "") -> Iterator[Report]:
+    """A ``Report`` that shows progress while the block runs: bars on a terminal, elsewhere a line per finished scene,
+    and one a minute if the number of maps is known.
 
     ``last_step`` labels what happens after the last frame of a scene.
     """
     from su3d_bench.runs.executors import SCENE_DONE
 
-    n_done, started = 0, time.monotonic()
+    n_done, started, begun = 0, time.monotonic(), set[tuple[str, str]]()
+    last = started
 
     def print_line(event: Event) -> None:
-        nonlocal n_done
-        if event.label == SCENE_DONE and not event.activity:
-            n_done += 1
+        nonlocal n_done, last
+        now = time.monotonic()
+        if event.label != SCENE_DONE:
+            begun.add((event.unit, event.label))
+            if n_maps and now - last >= MAPS_EVERY_S:
+                last, n = now, len(begun) - 1
+                left = _time_left(started, n, n_maps)
+                remark(f"{event.unit} {event.label}: {n} of {n_maps} maps done{left}", quiet=is_quiet)
+        elif not event.activity:
+            n_done, last = n_done + 1, now
             left = _time_left(started, n_done, n_scenes)
             remark(f"{event.unit} finished, {n_done} of {counted(n_scenes, 'scene')}{left}", quiet=is_quiet)
 
@@ -188,7 +198,10 @@ def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[
 
 def _time_left(started: float, n: int, n_all: int) -> str:
     """The estimated time left after ``n`` of ``n_all`` equal steps since ``started``, empty after the last."""
-    return "" if n >= n_all else f", about {(time.monotonic() - started) * (n_all / n - 1):.0f} s left"
+    if not 0 < n < n_all:
+        return ""
+    left_s = (time.monotonic() - started) * (n_all / n - 1)
+    return f", about {left_s:.0f} s left" if left_s < 120 else f", about {left_s / 60:.0f} minutes left"
 
 
 @contextmanager

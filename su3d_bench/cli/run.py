@@ -117,7 +117,8 @@ def execute(plan: Plan, arguments: argparse.Namespace, answer: Answer | None = N
         return EXIT_DONE
     if arguments.out is None:
         remark(f"{counted(len(plan.jobs), 'scene')}, run folder: {plan.folder.path}", quiet=arguments.quiet)
-    with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
+    n_maps = sum(len(job.parts) for job in plan.jobs)
+    with output.progress(len(plan.jobs), is_quiet=arguments.quiet, n_maps=n_maps) as report:
         result = run_plan(plan, report)
     (answer if answer and result.is_complete else _answer_result)(result, arguments)
     remark(*dict.fromkeys(f"su3d-bench: {line}" for _, _, line in result.failures))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
-from su3d_bench.cli.output import NARROW_BAR, _Board, drawn_bars
+from su3d_bench.cli.output import NARROW_BAR, _Board, drawn_bars, progress
 from su3d_bench.runs.executors import SCENE_DONE, Event
 
 LONG = "rooms/a-scene-with-a-long-name-that-no-terminal-has-room-for"
@@ -68,3 +69,22 @@ def test_scene_has_one_bar_for_its_current_method(monkeypatch: pytest.MonkeyPatc
         board.report(Event("", SCENE_DONE, activity="adding up"))
         (line,) = plain_lines(bars)
         assert "1/2" in line and "adding up" in line
+
+
+def test_log_gets_a_line_a_minute_with_the_number_of_maps(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    with progress(1, is_quiet=False, n_maps=10) as report:
+        for k in range(10):
+            now = 50.0 * k
+            report(Event("rooms/living0", f"m{k}", activity="opening"))
+        report(Event("rooms/living0", SCENE_DONE))
+    assert capsys.readouterr().err.splitlines() == [
+        "rooms/living0 m2: 2 of 10 maps done, about 7 minutes left",
+        "rooms/living0 m4: 4 of 10 maps done, about 5 minutes left",
+        "rooms/living0 m6: 6 of 10 maps done, about 3 minutes left",
+        "rooms/living0 m8: 8 of 10 maps done, about 100 s left",
+        "rooms/living0 finished, 1 of 1 scene",
+    ]
