@@ -74,7 +74,7 @@ lint: $(VENV)/dev
 $(VENV)/core: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 13) else f"Python {v[0]}.{v[1]} found; su3d-bench needs 3.11 or 3.12: make PYTHON=python3.11 ...")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo 'Installing su3d-bench and its dependencies into $(VENV): 2.1 GB on disk, a few minutes'
+	@echo 'Installing su3d-bench and its dependencies into $(VENV): 2.2 GB on disk, a few minutes'
 	@$(PIP) -e .
 	@touch $@
 
