@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -75,9 +75,10 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
                 jobs[scene, method] = steps = run.folder.job(scene, method).completion_records()
                 for fault in _job_faults(run, scene, method, steps, with_maps):
                     yield f"{method} / scene {scene}", fault
+    ceiling = cache(partial(run.scores, CEILING_METHOD))
     for method in run.methods:
         try:
-            scores, perfect = run.scores(method), run.scores(CEILING_METHOD)
+            scores, perfect = run.scores(method), ceiling()
             read_update_times(run, method)
         except Su3dError as error:
             yield method, str(error)
@@ -228,14 +229,17 @@ def _recomputed(
     numbers = replace(numbers, warnings=warnings, coverage=stated.coverage if is_elsewhere else numbers.coverage)
     recomputed = replace(record, kind=rules.kind, headline=rules.headline, ceiling=known["ceiling"] or None)
     recomputed = replace(recomputed, result=numbers)
-    sides = (counts, {scene: one for scene, one in truths.items() if one is not None})
-    bare = [pack_scores({key: replace(one, warnings=()) for key, one in side.items()}) for side in sides]
-    if is_elsewhere and bare[0] == bare[1]:
+    if is_elsewhere and _bare(counts) == _bare({scene: one for scene, one in truths.items() if one is not None}):
         recomputed = replace(recomputed, caveat=f"{record.caveat}; {SAME_COUNTS_CAVEAT}")
     if not is_elsewhere or record.labels is None:
         labels = labels_counted(rules, by_features=record.encoder is not None)
         recomputed = replace(recomputed, confidences=confidences_of(rules, numbers), labels=labels)
     return recomputed, fault and f"metrics.json does not follow from the counts: {fault}"
+
+
+def _bare(counts: Mapping[str, SceneScore]) -> bytes:
+    """The counts without warnings, to compare."""
+    return pack_scores({scene: replace(one, warnings=()) for scene, one in counts.items()})
 
 
 def _curve_values(record: ResultRecord) -> dict[str, Any]:
