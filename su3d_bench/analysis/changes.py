@@ -12,8 +12,8 @@ import numpy as np
 from su3d_bench.analysis.identity import over_time
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder, HasChanges, UsesGroundTruth
-from su3d_bench.core.maps import DenseFeatures, Instances
-from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array, SceneChange
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, GroundTruth, Int64Array, SceneChange
 from su3d_bench.formats.tables.table import NOT_MEASURED, Table, percent, text_table
 from su3d_bench.metrics import changes as metric
 from su3d_bench.metrics.changes import NEVER, MapAt, Pairs, Places
@@ -122,42 +122,51 @@ def _names(change: SceneChange, truth: GroundTruth, rules: ProtocolRules, ids: I
     return [name_of[class_of[one]] if n_objects[class_of[one]] == 1 else "" for one in ids.tolist()]
 
 
+def _answers(
+    found: MapAt, prediction: Instances | Partition | None, known: _Known, is_asked: BoolArray, rules: ProtocolRules,
+    encoder: Encoder,
+) -> Int64Array:  # fmt: skip
+    """Right answers of a map to "where is the NAME?", and questions (2,): about those of the places ``is_asked`` whose
+    object has been seen and is the only one of its name. Without ``prediction``, the oracle's, which has the objects.
+    """
+    places, _, names = known
+    asked = np.flatnonzero(is_asked & (places.after[0] <= found.n_updates) & (np.array(names) != ""))
+    if prediction is None:
+        first = np.array([np.flatnonzero(found.ids == places.object_ids[row])[0] for row in asked], np.int64)
+    elif prediction.features is None:
+        return np.zeros(2, np.int64)
+    else:
+        first = first_instances(rules, [names[row] for row in asked.tolist()], prediction, encoder)
+    return metric.answers(found, asked, first)
+
+
 def _count(
     known: _Known, part: Part, rules: ProtocolRules, files: Sequence[tuple[Path, int]], encoder: Encoder
 ) -> _Counts:
     """The counts of a method's maps in ``files``, each after so many updates; the oracle has what is there and seen.
 
-    "Where was the NAME?" is asked of the last map before the change, about places that are left, and "where is it?" of
-    the last map, about new places, if the object has been seen and no other has its name.
+    The last map before the change is asked where left objects were, the last after it where new ones are.
     """
-    (places, points, names), is_oracle = known, isinstance(build_method(part), UsesGroundTruth)
-    named = np.flatnonzero(np.array(names) != "")
-    texts = [names[row] for row in named.tolist()]
-    maps, answer_of = list[MapAt](), dict[int, Int64Array | None]()  # the instance that each text names, by updates
+    (places, points, _), is_oracle = known, isinstance(build_method(part), UsesGroundTruth)
+    maps, last = list[MapAt](), dict[str, tuple[MapAt, Instances | Partition | None]]()
     for path, n_updates in files:
-        if is_oracle:
-            maps.append(places.perfect(n_updates))
-            is_named = maps[-1].ids == places.object_ids[named][:, None]
-            answer_of[n_updates] = np.where(is_named.any(axis=1), is_named.argmax(axis=1), -1)
-            continue
-        prediction = read_prediction(path)
+        prediction = None if is_oracle else read_prediction(path)
         if isinstance(prediction, DenseFeatures):
             raise ConfigError(f"{part.name}: its maps have no instances; choose others with --methods")
-        masks, scores = masks_and_scores(prediction)
-        cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-        moved = transfer_masks(prediction.points, masks, points, cap_m, voxel_m)
-        ids = prediction.ids if isinstance(prediction, Instances) and len(prediction.ids) else np.arange(len(masks))
-        maps.append(places.map_at(n_updates, moved, np.asarray(ids, np.int64), scores))
-        has_features = prediction.features is not None
-        answer_of[n_updates] = first_instances(rules, texts, prediction, encoder) if has_features else None
-    pairs, before = dict(metric.count_changes(places, maps)), metric.last_before_change(places, maps)
-    for name, found, is_asked in (("then", before, places.is_left), ("now", maps[-1], places.is_new)):
-        first = None if found is None else answer_of[found.n_updates]
-        if found is not None and first is not None:
-            asked = (is_asked & (places.after[0] <= found.n_updates))[named]
-            pairs[f"where {name}"] = metric.answers(found, named[asked], first[asked])
+        if prediction is None:
+            maps.append(places.perfect(n_updates))
         else:
-            pairs[f"where {name}"] = np.zeros(2, np.int64)
+            masks, scores = masks_and_scores(prediction)
+            cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+            moved = transfer_masks(prediction.points, masks, points, cap_m, voxel_m)
+            ids = prediction.ids if isinstance(prediction, Instances) and len(prediction.ids) else np.arange(len(masks))
+            maps.append(places.map_at(n_updates, moved, np.asarray(ids, np.int64), scores))
+        last["then" if maps[-1].frame < places.change else "now"] = maps[-1], prediction
+    pairs, before = dict(metric.count_changes(places, maps)), metric.last_before_change(places, maps)
+    for when, is_asked in (("then", places.is_left), ("now", places.is_new)):
+        pairs[f"where {when}"] = np.zeros(2, np.int64)
+        if when in last:
+            pairs[f"where {when}"] = _answers(*last[when], known, is_asked, rules, encoder)
     if before is None or not getattr(build_method(part), "keeps_ids", False):
         return pairs, None
     return pairs, metric.count_stages(places, [before, maps[-1]], rules.thresholds)

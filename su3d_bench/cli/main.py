@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from textwrap import wrap
 
-from su3d_bench.cli.options import Parser
+from su3d_bench.cli.options import HelpFormatter, Parser
 from su3d_bench.cli.output import remark
 from su3d_bench.cli.paths import check_outputs
 from su3d_bench.core import errors
@@ -36,7 +36,7 @@ EPILOG = """examples:
 """
 
 
-class Help(argparse.RawDescriptionHelpFormatter):
+class Help(HelpFormatter):
     """Lists the commands in groups, each with the first clause of its help."""
 
     def _format_action(self, action: argparse.Action) -> str:

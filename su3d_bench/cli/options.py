@@ -30,6 +30,13 @@ TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 LANGUAGE = ("perception", "language")
 
 
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Shows help texts as they are written, with any percent sign."""
+
+    def _expand_help(self, action: argparse.Action) -> str:
+        return action.help or ""
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt command or option."""
 
@@ -101,7 +108,7 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
     is_optional = value.startswith("[")
     several = value[1:-1] if is_optional else value
     metavar = several.removesuffix("...")
-    settings: dict[str, Any] = {"help": text.replace("%", "%%")}
+    settings: dict[str, Any] = {"help": text}
     if metavar:
         settings["metavar"] = metavar
     if is_optional or several != metavar:
@@ -149,10 +156,10 @@ def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
     summary = " ".join(summary.split())
     parser: Parser = verbs.add_parser(
         name,
-        help=(summary[:1].lower() + summary[1:].rstrip(".")).replace("%", "%%"),
+        help=summary[:1].lower() + summary[1:].rstrip("."),
         description=summary,
         epilog="\n  ".join(["examples:", *map(str.strip, examples.splitlines())]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     return parser
 

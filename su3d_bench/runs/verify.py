@@ -66,6 +66,7 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
     """The faults of ``run``; its ``results`` are replaced by those of its counts."""
     yield from _record_faults(run)
     jobs: Jobs = {}
+    settings = {".".join(path): value for path, value in run.settings.items()}
     failed = {(failure.scene, failure.method) for failure in run.record.failed}
     own = [one.result for one in run.results.values() if one.result is not None and one.method not in run.external]
     scored = {scene for result in own for scene in result.scenes}  # the ceiling's counts exist, too
@@ -73,7 +74,7 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
         for scene in run.scenes:
             if (scene, method) not in failed and (method in run.methods or scene in scored):
                 jobs[scene, method] = steps = run.folder.job(scene, method).completion_records()
-                for fault in _job_faults(run, scene, method, steps, with_maps):
+                for fault in _job_faults(run, scene, method, steps, settings, with_maps):
                     yield f"{method} / scene {scene}", fault
     ceiling = cache(partial(run.scores, CEILING_METHOD))
     for method in run.methods:
@@ -117,9 +118,13 @@ def _record_faults(run: FinishedRun) -> Iterator[Fault]:
 
 
 def _job_faults(
-    run: FinishedRun, scene: str, method: str, steps: Mapping[str, CompletionRecord], with_maps: bool
-) -> Iterator[str]:
-    """Files of a job that are not those that the run wrote, and its inputs that the records of the run contradict."""
+    run: FinishedRun, scene: str, method: str, steps: Mapping[str, CompletionRecord], settings: Mapping[str, Any],
+    with_maps: bool,
+) -> Iterator[str]:  # fmt: skip
+    """Files of a job that are not those that the run wrote, and its inputs that the records of the run contradict.
+
+    ``settings``: the run's, by their names in keys.
+    """
     job, record = run.folder.job(scene, method), run.record
     files = {name: digest for step in steps.values() for name, digest in step.files.items()}
     maps = (job.prediction.name, features_beside(job.prediction).name)
@@ -146,10 +151,9 @@ def _job_faults(
     stated |= {f"packages.{name}": version for name, version in record.packages.items()}
     if method in run.external:
         stated["predictions"] = digest_json(run.external[method].files.get(scene, {}))
-    settings = {".".join(path): json.dumps(value, ensure_ascii=False) for path, value in run.settings.items()}
     for name, text in key.items():
         if name.startswith(("method.", "dataset.", "perception.")) and method in run.methods:
-            stated[name] = settings.get(name, "null")
+            stated[name] = json.dumps(settings.get(name), ensure_ascii=False)
         if name in stated and text != stated[name] and text not in stated[name].split(" or "):
             yield f"done.json: {name} is {printable(text, 60)}, the run says {printable(stated[name], 60)}"
     if score.get("predict") != digest_json(dict(key)):

@@ -98,7 +98,7 @@ def _summary(parser: argparse.ArgumentParser) -> str:
 def _page(name: str, parser: argparse.ArgumentParser) -> str:
     examples = [line.strip() for line in (parser.epilog or "").splitlines()[1:] if line.strip()]
     rows = [
-        f"| `{_usage(action)}` | {cell((action.help or '').replace('%%', '%'))} |"
+        f"| `{_usage(action)}` | {cell(action.help or '')} |"
         for action in parser._actions
         if action.help != argparse.SUPPRESS and not COMMON_OPTIONS & set(action.option_strings)
     ]
