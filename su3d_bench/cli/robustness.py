@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import output
 from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, index, output_path
-from su3d_bench.cli.run import add_run_options, execute, plan_of
+from su3d_bench.cli.run import add_run_options, execute, plan_of, settings_of
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
@@ -130,13 +130,23 @@ def call_run(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.advice import estimate
 
     conditions = conditions_of(arguments.corruptions, arguments.severities, arguments.only)
-    arguments.methods = methods_of(arguments.methods or ["opensu3d"], conditions)
-    arguments.pictures = bool(arguments.pictures)
+    arguments.methods = methods_of(_clean_targets(arguments), conditions)
     plan = plan_of(arguments)
     minutes = sum(row.seconds for row in estimate(plan) if not row.is_done) / plan.n_workers / 60
     cells = f"{counted(len(plan.methods), 'cell')} on {counted(len(plan.jobs), 'scene')}"
-    output.remark(f"{cells}: about {minutes:.0f} minutes", quiet=arguments.quiet)
+    output.remark(f"{cells}: about {counted(max(1, round(minutes)), 'minute')}", quiet=arguments.quiet)
     return execute(plan, arguments, _answer_sweep)
+
+
+def _clean_targets(arguments: argparse.Namespace) -> list[str]:
+    """The requested methods, from the flag or the file; no pictures are drawn unless one of these asks for them."""
+    from su3d_bench.core.config import DEFAULT_SOURCE, RunConfig, resolve
+    from su3d_bench.robustness.sweep import clean_targets
+
+    settings = settings_of(arguments)
+    if settings.source(("pictures",)) == DEFAULT_SOURCE:
+        arguments.pictures = False
+    return clean_targets(resolve(settings, (), RunConfig).methods)
 
 
 def _answer_sweep(result: RunResult, arguments: argparse.Namespace) -> None:
@@ -201,8 +211,7 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
         raise ConfigError("robustness tolerance: name the run folder with --out, such as --out runs/tolerance")
     conditions = conditions_of(arguments.corruptions, [1], [])
     corruptions = [CORRUPTIONS[one[0].corruption.address] for one in conditions if len(one) == 1]
-    target_of = {named_method(text).name: text for text in arguments.methods or ["opensu3d"]}
-    arguments.pictures = bool(arguments.pictures)
+    target_of = {named_method(text).name: text for text in _clean_targets(arguments)}
     if arguments.dry_run:  # one of its steps
         highest = [(Condition(corruption, MAX_SEVERITY),) for corruption in corruptions]
         arguments.methods = methods_of(list(target_of.values()), highest)

@@ -48,7 +48,9 @@ def add_run_options(parser: Parser) -> None:
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
     parser.option(
-        "--pictures", "draw the maps into the run folder (default: yes)", action=argparse.BooleanOptionalAction
+        "--pictures",
+        "draw the maps into the run folder (default: yes; sweeps of robustness: no)",
+        action=argparse.BooleanOptionalAction,
     )
     parser.option(
         "--accept-poses",

@@ -53,7 +53,7 @@ def parse_conditions(text: str) -> tuple[Condition, ...]:
 
 
 def _condition(text: str) -> Condition:
-    address, _, severity = text.rpartition("/")
+    address, severity = (text, "") if text in CORRUPTIONS else text.rpartition("/")[::2]
     if address not in CORRUPTIONS:
         raise ConfigError(f"unknown corruption '{address or text}'{suggest(address or text, CORRUPTIONS)}")
     if not re.fullmatch(r"\d(\.\d{1,6})?", severity) or float(severity) > MAX_SEVERITY:

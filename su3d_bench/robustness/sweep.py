@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from su3d_bench.core.errors import ConfigError, counted, suggest
 from su3d_bench.corruptions.apply import CORRUPTIONS, Cell, Condition, parse_conditions
 from su3d_bench.corruptions.model import MAX_SEVERITY
+from su3d_bench.runs.plan import method_targets, named_method
 
 MAX_METHODS = 2000
 
@@ -45,6 +46,14 @@ def _combinations(text: str) -> Iterator[tuple[str, ...]]:
 
 def _families() -> list[str]:
     return list(dict.fromkeys(row.family for row in CORRUPTIONS.values()))
+
+
+def clean_targets(methods: Sequence[str]) -> list[str]:
+    """The requested methods with ``all`` replaced by names; ``ConfigError`` for one that is already corrupted."""
+    targets = method_targets(methods)
+    if corrupted := [target for target in targets if named_method(target).corruption]:
+        raise ConfigError(f"--methods {corrupted[0]}: is already under a corruption; name the method alone")
+    return targets
 
 
 def methods_of(methods: Sequence[str], conditions: Sequence[tuple[Condition, ...]]) -> list[str]:

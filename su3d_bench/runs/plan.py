@@ -218,7 +218,7 @@ def make_plan(
     check_execution(config)
     if config.profile not in PROFILES:
         raise ConfigError(f"unknown profile '{config.profile}'{suggest(config.profile, PROFILES)}")
-    named_methods = [named_method(text) for text in _method_targets(config.methods)]
+    named_methods = [named_method(text) for text in method_targets(config.methods)]
     _check_unique_names("--methods", [(method.name, method.essence) for method in named_methods])
     named = {method.name: method for method in named_methods}
     named_datasets = [(str(registry.load("dataset", target).name), target) for target in dataset_targets(config.scenes)]
@@ -353,7 +353,8 @@ def _all_systems() -> list[str]:
     return [name for name, method in loaded.items() if getattr(method, "is_system", True)]
 
 
-def _method_targets(methods: Sequence[str]) -> list[str]:
+def method_targets(methods: Sequence[str]) -> list[str]:
+    """The requested methods once each, ``all`` replaced by the names of all systems; ``ConfigError`` for a scene."""
     named = [name for method in methods for name in (_all_systems() if method == "all" else [method])]
     targets = list(dict.fromkeys(named))
     for target in targets:

@@ -11,7 +11,9 @@ from unittest.mock import Mock
 import pytest
 
 from su3d_bench.baselines.openmask3d import method, proposals
-from su3d_bench.cli.main import main
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.cli.run import plan_of
+from su3d_bench.core.registry import METHODS
 from su3d_bench.corruptions.apply import CORRUPTIONS
 from su3d_bench.perception import cache, profiles
 
@@ -153,11 +155,30 @@ def test_update_that_loses_all_depth_has_no_effect(tmp_path: Path, monkeypatch: 
     assert main(words.split()) == 0
 
 
+def test_methods_come_from_the_flag_or_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run.toml").write_text('methods = ["sam3d"]\npictures = true\n')
+    for words, methods, draws in (
+        ("--methods all", {*METHODS} - {"oracle", "command"}, False),
+        (f"--config {tmp_path / 'run.toml'}", {"sam3d"}, True),
+    ):
+        words = f"robustness run rooms/bathroom0 --only image/jpeg/3 --dry-run --json {words}"
+        arguments = build_parser("robustness").parse_args(words.split())
+        arguments.call(arguments)
+        jobs = json.loads(capsys.readouterr().out)["jobs"]
+        assert {job["method"] for job in jobs} == {one + end for one in methods for end in ("", "~image-jpeg-3")}
+        assert plan_of(arguments).jobs[0].config.pictures is draws
+    words = f"robustness tolerance rooms/bathroom0 --config {tmp_path / 'run.toml'} --corruptions image/jpeg --dry-run"
+    assert main(f"{words} --out {tmp_path / 'out'}".split()) == 0
+    assert "sam3d~image-jpeg-5" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ("run rooms/bathroom0 --corruptions dpeth", "did you mean 'depth'"),
         ("run rooms/bathroom0 --only depth/holes/9", "severity from 0 to 5"),
+        ("run rooms/bathroom0 --only depth/holes+pose/jumps/3", "'depth/holes': expected depth/holes/SEVERITY"),
+        ("run rooms/bathroom0 --methods sam3d~depth/holes/3", "is already under a corruption"),
         ("run rooms/bathroom0 --severities 7", "expected 0 to 5"),
         ("tolerance rooms/bathroom0 --share 2 --out out", "must be above 0 and below 1"),
         ("tolerance rooms/bathroom0", "name the run folder with --out"),

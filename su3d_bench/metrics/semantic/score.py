@@ -82,9 +82,9 @@ class SemanticMetric(Metric[SemanticCounts]):
         """The headline values (R,) of groups: means over their classes with ground truth in the drawn scenes."""
         wanted = self.rules.group_headline
         classes = self.resampled_classes(counts, weights) if wanted else {}
-        values = {}
+        values, scored = {}, self.rules.scored
         for name, (value, of_group) in wanted.items():
-            names = [self.rules.scored[position].name for position in of_group]
+            names = [scored[position].name for position in of_group]
             table = [classes[one][GROUP_COLUMNS[value]] for one in names if one in classes]
             missing = np.full((len(weights), 1), np.nan)
             values[name] = row_means(np.column_stack([missing, *table]))
