@@ -23,7 +23,8 @@ def without_cells(run: FinishedRun) -> FinishedRun:
     cells = {cell.name for own in cells_of(run.methods).values() for cell in own}
     methods = tuple(method for method in run.methods if method not in cells)
     results = {key: result for key, result in run.results.items() if key[0] not in cells}
-    return replace(run, record=replace(run.record, methods=methods), results=results)
+    unscored = tuple(reason for reason in run.record.unscored if reason.method not in cells)
+    return replace(run, record=replace(run.record, methods=methods, unscored=unscored), results=results)
 
 
 def family_means(values: Mapping[Cell, float]) -> dict[str, float]:

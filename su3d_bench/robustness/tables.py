@@ -73,7 +73,7 @@ def _cells_table(method: MethodResult, metric: str) -> Table:
 
 
 def _severity(one: CellResult) -> str:
-    return "+".join(f"{condition.severity:g}" for condition in one.cell.conditions)
+    return "+".join(dict.fromkeys(f"{condition.severity:g}" for condition in one.cell.conditions))  # 3 of a pair at 3
 
 
 def _cell(one: CellResult | None) -> str:

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,14 @@ from painted_runs import metrics, painted_page
 from PIL import Image
 from registry_bundles import painted_bundle, read_bundle, rewrite_bundle
 
+from su3d_bench.analysis.sweeps import without_cells
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.reproducing.registry import rows_of_bundle
 from su3d_bench.robustness.page import page_sweeps
 from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.verify import read_checked
+from su3d_bench.store.records import UnscoredRecord
 
 CLEAN = ["collector", "collector@drop=1"]
 CONDITIONS = ["masks/dropped/1", "masks/dropped/5", "pose/jumps/5"]
@@ -53,6 +57,13 @@ def test_page_lists_only_clean_methods_of_a_sweep(data: dict[str, Any]) -> None:
     for part in ("results", "timing", "errors", "maps"):
         assert {one["method"] for one in data[part]} == set(CLEAN), part
     assert len(data["comparisons"]) == 1
+
+
+def test_reasons_why_cells_were_not_scored_are_left_out(made: Path) -> None:
+    run = read_checked(made / "runs" / "sweep")
+    unscored = tuple(UnscoredRecord("painted/a", method, PROTOCOL, "no instances") for method in run.methods)
+    clean = without_cells(replace(run, record=replace(run.record, unscored=unscored)))
+    assert [reason.method for reason in clean.record.unscored] == CLEAN
 
 
 def test_page_has_the_scores_of_every_cell(made: Path, data: dict[str, Any]) -> None:

@@ -83,6 +83,16 @@ def test_tables_of_a_sweep_fit_on_a_page(result: SweepResult) -> None:
     assert max(lines_of_floats(FORMATS["latex"](tables))) <= PAGE_LINES
 
 
+def test_pair_at_one_severity_is_in_the_column_of_that_severity() -> None:
+    cells = [Cell("a", parse_conditions(text)) for text in ("depth/holes/3", "depth/holes/3+pose/jumps/3")]
+    cells.append(Cell("a", parse_conditions("depth/holes/1+pose/jumps/3")))
+    found = {cell.name: numbers(np.full(len(SCENES), 0.4)) for cell in cells}
+    own = measures._method_result("a", cells, {"a": numbers(np.full(len(SCENES), 0.5)), **found}, SCENES)
+    table = sweep_tables(SweepResult("homes-instance", "AP50", SCENES, "a", (own,)), of_embedded=False)[1]
+    assert isinstance(table, Table)
+    assert table.columns == ("unit", "severity 1+3", "severity 3")
+
+
 def test_figure_fits_on_a_page_and_its_legend_covers_no_panel(
     result: SweepResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
