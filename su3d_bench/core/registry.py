@@ -54,12 +54,13 @@ GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
 REQUIRED_CLASS_ATTRS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}
 TEXT_CLASS_ATTRS: dict[str, type] = {"name": str, "label_space": str, "variants": tuple}
+MARK = "~"  # between a method and its corruptions: opensu3d~depth-holes-4
 MIN_SIMILARITY = 0.84  # of a name to the intended one: a letter missing, added, changed or in the wrong place
 
 
 def base_name(method: str) -> str:
-    """The name of a method without its variant: ``opensu3d`` of ``opensu3d@top_m=1``."""
-    return method.partition("@")[0]
+    """The name of a method without variant and corruptions: ``opensu3d`` of ``opensu3d@top_m=1~depth-holes-4``."""
+    return method.partition(MARK)[0].partition("@")[0]
 
 
 def names(kind: str) -> list[str]:

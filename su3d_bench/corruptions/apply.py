@@ -17,6 +17,7 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import StageTimer
+from su3d_bench.core.registry import MARK
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Int64Array, PerceptionNeeds
 from su3d_bench.corruptions import calibration, depth, image, light, masks, names, poses, time
 from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption, Recording, Stage, generator
@@ -24,7 +25,6 @@ from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption, Recording, St
 # A new corruption is a function and a row in the file of its family.
 FAMILIES = (calibration, depth, poses, time, light, image, masks, names)
 CORRUPTIONS: dict[str, Corruption] = {row.address: row for family in FAMILIES for row in family.ROWS}
-MARK = "~"  # between a method and its corruptions
 
 
 @dataclass(frozen=True)

@@ -77,9 +77,21 @@ class Corruption:
         return f"{self.family}/{self.name}"
 
     def value_at(self, severity: float) -> float:
-        """The value at a severity 0..5, linear between whole severities."""
+        """The value at a severity 0..5, linear between whole severities; the nearest one if values are whole."""
         value = float(np.interp(severity, range(MAX_SEVERITY + 1), (self.neutral, *self.values)))
         return float(round(value)) if self.is_whole else value
+
+    def severity_of(self, value: float) -> float:
+        """The severity of a value, the inverse of ``value_at``."""
+        sign = 1 if self.values[-1] > self.neutral else -1
+        return float(np.interp(sign * value, sign * np.array((self.neutral, *self.values)), range(MAX_SEVERITY + 1)))
+
+    def largest_until(self, severity: float) -> float:
+        """The value at a severity; if values are whole, the last one that is not worse."""
+        value = self.value_at(severity)
+        if self.is_whole and self.severity_of(value) > severity:
+            return value - 1 if self.values[-1] > self.neutral else value + 1
+        return value
 
 
 def generator(corruption: Corruption, seed: int, scene: str, index: int = 0) -> Generator:

@@ -367,7 +367,7 @@ def check_no_custom_code(run: FinishedRun) -> None:
         for text in texts if isinstance(texts, list | tuple) else (texts,):
             if name == "methods" and text in run.external:
                 continue
-            base = str(text).partition("@")[0].partition("/")[0]
+            base = registry.base_name(str(text)).partition("/")[0]
             known = registry.METHODS if name == "methods" else registry.DATASETS if name == "scenes" else None
             if ".py" in str(text) or str(text).endswith(".toml") or (known is not None and base not in known):
                 raise StoreError(f"uses the user-defined '{printable(str(text), 80)}', which a bundle cannot contain")

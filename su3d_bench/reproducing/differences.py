@@ -246,7 +246,7 @@ def _of_frames(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterat
 
 def _stride(row: Measured, run: FinishedRun) -> int | None:
     stride = run.settings.get(("stride",), 0) or run.settings.get(("method", row.method, "stride"))
-    if stride is None and row.method.partition("@")[0] in registry.METHODS:
+    if stride is None and registry.base_name(row.method) in registry.METHODS:
         return None
     return None if stride is None else int(stride)
 

@@ -63,7 +63,7 @@ def _flags(asked: Mapping[KeyPath, Any], run: FinishedRun, method: str) -> Itera
 
 def _settings(asked: Mapping[KeyPath, Any], method: str) -> Iterator[str]:
     """``--set`` with requested settings of this method, datasets and perception; a variant's name has its own."""
-    base = method.partition("@")[0]
+    base = plugins.base_name(method)
     pairs = []
     for path, value in asked.items():
         if len(path) > 2 and path[0] in ("method", "dataset"):
@@ -224,7 +224,7 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
     per_scene = record.result.per_scene
     is_elsewhere = entry.method in run.external
     manifest = unpacked.manifest
-    name = entry.method.partition("@")[0]
+    name = plugins.base_name(entry.method)
     is_known = not is_elsewhere and name in plugins.names("method")
     about = about_method(name, plugins.load("method", name)) if is_known else {}
     source = re.search(r"https://[^\s;,]+", about.get("source") or "")

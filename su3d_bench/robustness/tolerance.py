@@ -27,8 +27,9 @@ N_STEPS = 6  # of the bisection: the severity is then known to 5 / 2^6
 class Tolerance:
     """The ``severity`` (0..5), and its ``value`` in the corruption's unit, at which ``method`` falls to the share kept.
 
-    ``interval`` of the value, None if scenes do not differ. ``is_beyond``: the share is kept at the highest severity
-    that was measured, so that the value is a lower bound.
+    Of whole values (frames, pixels) it is the last one that keeps the share. ``interval`` of the value, None if scenes
+    do not differ. ``is_beyond``: the share is kept at the highest severity that was measured, so that the value is a
+    lower bound.
     """
 
     method: str
@@ -74,15 +75,16 @@ def find_tolerances(
 
 
 def _tolerance(method: str, corruption: Corruption, curve: Mapping[float, Numbers], share: float) -> Tolerance:
-    severities = np.array(sorted(curve))
-    values = np.array([curve[severity].without_each for severity in severities])  # (K, 1 + G)
+    values = np.array([curve[severity].without_each for severity in sorted(curve)])  # (K, 1 + G)
+    # whole values are rounded where they are applied
+    severities = np.array([corruption.severity_of(corruption.value_at(severity)) for severity in sorted(curve)])
     crossings = np.array([crossing(severities, column, share) for column in values.T])
     highest = float(severities[-1])
     interval = jackknife_interval(crossings, bounds=(0.0, highest))
     severity = float(crossings[0])
-    low, high = (None, None) if interval is None else map(corruption.value_at, interval)
+    low, high = (None, None) if interval is None else map(corruption.largest_until, interval)
     return Tolerance(
-        method, corruption, severity, corruption.value_at(severity),
+        method, corruption, severity, corruption.largest_until(severity),
         None if low is None or high is None else (min(low, high), max(low, high)), severity >= highest,
     )  # fmt: skip
 

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError, Su3dError
 from su3d_bench.core.files.atomic import is_file
-from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.corruptions.apply import MARK
+from su3d_bench.core.registry import CEILING_METHOD, MARK
 from su3d_bench.runs.job import build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.real_time import is_measured

@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import DataError, printable, reading, shown
+from su3d_bench.core.registry import base_name
 from su3d_bench.core.system.files import file_text, regular
 
 Queue = Literal["newest", "drop-new", "drop-old"]
@@ -223,7 +224,7 @@ def read_costs(file: Path, method: str, seed: list[int]) -> tuple[str, Callable[
     import numpy as np
 
     generator = np.random.default_rng(seed)
-    names = method, method.partition("@")[0].partition("~")[0]
+    names = method, base_name(method)
     try:
         rows = [row for row in csv.DictReader(_lines(file)) if row.get("method", method) in names]
         (device,) = {printable(row["device"] or "", 300) for row in rows}

@@ -26,10 +26,10 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, counted, printable, some, suggest
-from su3d_bench.core.registry import CEILING_METHOD, GENERATED
+from su3d_bench.core.registry import CEILING_METHOD, GENERATED, MARK
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.types import ImageDomain
-from su3d_bench.corruptions.apply import MARK, parse_conditions
+from su3d_bench.corruptions.apply import parse_conditions
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import (
     ALL_PROTOCOLS,

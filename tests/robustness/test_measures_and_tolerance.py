@@ -79,6 +79,27 @@ def test_tolerance_of_a_linear_fall_is_exact() -> None:
     assert found.value == pytest.approx(HOLES.value_at(2.5))
 
 
+@pytest.mark.parametrize(
+    ("name", "last_kept"),
+    [
+        ("depth/edge-loss", range(8)),
+        ("time/depth-lag", range(20)),
+        ("image/zoom-blur", range(5)),
+        ("image/jpeg", range(8, 26)),  # a lower quality is worse
+    ],
+)
+def test_whole_tolerance_is_the_last_value_that_is_kept(name: str, last_kept: range) -> None:
+    row = CORRUPTIONS[name]
+    for last in last_kept:
+
+        def score(severity: float, scene: int, last: int = last) -> float:
+            value = row.value_at(severity)
+            return 0.8 if (value >= last if name == "image/jpeg" else value <= last) else 0.5
+
+        (found,) = find_tolerances(evaluator(score, 2), ["method"], [row])
+        assert found.value == last
+
+
 def test_name_of_a_cell_is_read_back() -> None:
     for text in ("depth/holes/4", "pose/jitter-rotation/2.5", "depth/edge-loss/1+names/typos/3"):
         cell = Cell("opensu3d@top_m=1", parse_conditions(text))

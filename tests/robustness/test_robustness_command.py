@@ -13,9 +13,12 @@ import pytest
 from su3d_bench.baselines.openmask3d import method, proposals
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.run import plan_of
+from su3d_bench.core.errors import StoreError
 from su3d_bench.core.registry import METHODS
 from su3d_bench.corruptions.apply import CORRUPTIONS
 from su3d_bench.perception import cache, profiles
+from su3d_bench.perception.oracle import ORACLE_CAVEAT
+from su3d_bench.runs.verify import read_checked
 
 SMALL = "--set rooms.width=160 rooms.height=120 rooms.n_frames=40 --stride 10 --profile oracle --jobs 1"
 ROOM = f"rooms/bathroom0 {SMALL} --protocols rooms-instance"
@@ -96,6 +99,28 @@ def test_report_has_every_family_and_writes_its_figure(
     assert figure.read_bytes()[:4] == b"\x89PNG"
     assert main(f"robustness report {sweep} --format latex".split()) == 0
     assert r"\begin{tabular}" in capsys.readouterr().out
+
+
+def test_cell_whose_records_hide_perfect_masks_is_refused(sweep: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(sweep, tmp_path / "run")
+    read_checked(run)
+    name = "opensu3d~depth-holes-4"
+    metrics = json.loads((run / "metrics.json").read_text())
+    for result in metrics["results"]:
+        result["caveat"] = None if result["method"] == name else result["caveat"]
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    done = run / "scenes" / "rooms.bathroom0" / name / "done.json"
+    done.write_text(done.read_text().replace(json.dumps(ORACLE_CAVEAT), "null"))
+    with pytest.raises(StoreError, match=f"{name} .*the method used ground truth"):
+        read_checked(run)
+
+
+def test_bundle_of_a_sweep_is_scored_again(sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bundle = tmp_path / "sweep.zip"
+    assert main(f"report bundle {sweep} --out {bundle} --quiet".split()) == 0
+    capsys.readouterr()
+    assert main(["report", "verify", str(bundle)]) == 0
+    assert "verified (bit-exact)" in capsys.readouterr().out
 
 
 def test_tolerance_between_the_severities_of_a_sweep(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
