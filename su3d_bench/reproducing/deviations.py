@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.analysis.sweeps import without_cells
 from su3d_bench.core.config import flatten, toml_value
 from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.files.atomic import read_json
+from su3d_bench.core.registry import base_name
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.formats.tables.table import Table, text_table
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -213,9 +215,8 @@ def run_deviations(runs: Iterable[FinishedRun]) -> list[Deviation]:
     """The differences of all runs of OpenSU3D, each once with the names of its runs."""
     found: dict[tuple[str, str], Deviation] = {}
     for run in runs:
-        for method in (
-            name for name in run.methods if name.partition("@")[0] == "opensu3d" and name not in run.external
-        ):
+        clean = without_cells(run).methods
+        for method in (name for name in clean if base_name(name) == "opensu3d" and name not in run.external):
             for one in deviations(facts_of(run, method)):
                 known = found.setdefault((one.name, one.here), one)
                 names = tuple(dict.fromkeys((*known.runs, run.folder.path.name)))
