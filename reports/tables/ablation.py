@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, counted
+from su3d_bench.core.registry import base_name
 from su3d_bench.formats.tables.table import Cell, Table, TableRow, signed
 from su3d_bench.numerics.statistics import holm, sign_flip_test
 from su3d_bench.reports.tables import paper
@@ -59,7 +60,7 @@ def ablation_table(
         labels = [row.method if row.is_whole else f"{row.method} ({row.scenes_text} scenes)" for row in own]
         notes |= dict.fromkeys(paper.run_notes(own, labels))
     notes |= dict.fromkeys(note for half in halves for note in half.notes)
-    is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
+    is_papers = with_published and base_name(sweep[0].method) == "opensu3d"
     figures = paper.figures_of(is_wanted=is_papers, table="I")
     reported, sources = paper.reported_rows(figures, METRICS, len(METRICS))
     protocols = dict.fromkeys(rows_of[0].protocol for rows_of in used)

@@ -81,17 +81,20 @@ class Corruption:
         value = float(np.interp(severity, range(MAX_SEVERITY + 1), (self.neutral, *self.values)))
         return float(round(value)) if self.is_whole else value
 
-    def severity_of(self, value: float) -> float:
-        """The severity of a value, the inverse of ``value_at``."""
+    def applied(self, severity: float) -> float:
+        """The severity of the value that is used at ``severity``: another one if values are whole."""
+        if not self.is_whole:
+            return severity
         sign = 1 if self.values[-1] > self.neutral else -1
-        return float(np.interp(sign * value, sign * np.array((self.neutral, *self.values)), range(MAX_SEVERITY + 1)))
+        known = sign * np.array((self.neutral, *self.values))
+        return float(np.interp(sign * self.value_at(severity), known, range(MAX_SEVERITY + 1)))
 
-    def largest_until(self, severity: float) -> float:
+    def value_within(self, severity: float) -> float:
         """The value at a severity; if values are whole, the last one that is not worse."""
         value = self.value_at(severity)
-        if self.is_whole and self.severity_of(value) > severity:
-            return value - 1 if self.values[-1] > self.neutral else value + 1
-        return value
+        if self.applied(severity) <= severity:
+            return value
+        return value - 1 if self.values[-1] > self.neutral else value + 1
 
 
 def generator(corruption: Corruption, seed: int, scene: str, index: int = 0) -> Generator:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.analysis.tables import choose, measured_results, numbered_tables
-from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.core.files.atomic import is_file, make_folder
@@ -246,8 +245,6 @@ def _of_frames(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterat
 
 def _stride(row: Measured, run: FinishedRun) -> int | None:
     stride = run.settings.get(("stride",), 0) or run.settings.get(("method", row.method, "stride"))
-    if stride is None and registry.base_name(row.method) in registry.METHODS:
-        return None
     return None if stride is None else int(stride)
 
 

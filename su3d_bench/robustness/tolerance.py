@@ -76,16 +76,15 @@ def find_tolerances(
 
 def _tolerance(method: str, corruption: Corruption, curve: Mapping[float, Numbers], share: float) -> Tolerance:
     values = np.array([curve[severity].without_each for severity in sorted(curve)])  # (K, 1 + G)
-    # whole values are rounded where they are applied
-    severities = np.array([corruption.severity_of(corruption.value_at(severity)) for severity in sorted(curve)])
+    severities = np.array([corruption.applied(severity) for severity in sorted(curve)])
     crossings = np.array([crossing(severities, column, share) for column in values.T])
     highest = float(severities[-1])
     interval = jackknife_interval(crossings, bounds=(0.0, highest))
     severity = float(crossings[0])
-    low, high = (None, None) if interval is None else map(corruption.largest_until, interval)
+    ends = sorted(map(corruption.value_within, interval or ()))
     return Tolerance(
-        method, corruption, severity, corruption.largest_until(severity),
-        None if low is None or high is None else (min(low, high), max(low, high)), severity >= highest,
+        method, corruption, severity, corruption.value_within(severity),
+        (ends[0], ends[1]) if ends else None, severity >= highest,
     )  # fmt: skip
 
 
